@@ -144,12 +144,14 @@ class Plan(Config):
     braking_mps2: Positive
     top_speed_mps: Positive
 
-    def limits(self, lateral_mps2: float, adhesion: float = 1.0) -> SpeedLimits:
-        """Return the speed limits at a planned lateral acceleration, for one adhesion."""
+    def limits(
+        self, lateral_mps2: float, acceleration: float = 1.0, braking: float = 1.0
+    ) -> SpeedLimits:
+        """Return the speed limits at a planned lateral acceleration, and factors of the others."""
         return SpeedLimits(
             lateral_mps2=lateral_mps2,
-            acceleration_mps2=self.acceleration_mps2 * adhesion,
-            braking_mps2=self.braking_mps2 * adhesion,
+            acceleration_mps2=self.acceleration_mps2 * acceleration,
+            braking_mps2=self.braking_mps2 * braking,
             top_speed_mps=self.top_speed_mps,
         )
 
@@ -278,7 +280,7 @@ class FleetPlan(DrawnPlan):
             sensors=sensors,
             track=track,
             adhesion=adhesion,
-            limits=self.limits(lateral_mps2, adhesion),
+            limits=self.limits(lateral_mps2, adhesion, adhesion),
             speed_factor=speed_factor,
             flaws=flaws,
         )
@@ -450,12 +452,8 @@ class TrialPlan(DrawnPlan):
         adhesion = self.adhesion.draw(drive_rng)
         friction = self.friction_use.draw(drive_rng) * adhesion * GRAVITY_MPS2
         lateral_mps2 = min(self.lateral_mps2.draw(drive_rng), friction)
-        limits = SpeedLimits(
-            lateral_mps2=lateral_mps2,
-            acceleration_mps2=self.acceleration_mps2 * self.acceleration.draw(drive_rng),
-            braking_mps2=self.braking_mps2 * self.braking.draw(drive_rng),
-            top_speed_mps=self.top_speed_mps,
-        )
+        acceleration, braking = self.acceleration.draw(drive_rng), self.braking.draw(drive_rng)
+        limits = self.limits(lateral_mps2, acceleration, braking)
         loaded_kg = vehicle.body.sprung_mass_kg * self.load.draw(drive_rng)
         vehicle = vehicle.with_sprung_mass(loaded_kg).with_tyres(
             stiffness_factor=self.tyre_stiffness.draw(drive_rng),
