@@ -44,6 +44,11 @@ class FleetEvaluation:
     def _models(self) -> FleetModels:
         return FleetModels(self.warehouse)
 
+    def _screen(self, cohort: str, include_faulty: bool) -> SensorScreen:
+        if include_faulty:
+            return SensorScreen(cohort)
+        return screen_computed_drives(self.warehouse, cohort)
+
     def score(
         self,
         model: str | ModelVersion | None = None,
@@ -74,10 +79,7 @@ class FleetEvaluation:
         predicate = ALL_DRIVES if cohort is None else cohort
         signals = self.warehouse.catalog.signals
         rows = cohort_of_rows(signals, predicate)
-        if include_faulty:
-            examined = SensorScreen(predicate)
-        else:
-            examined = screen_computed_drives(self.warehouse, predicate)
+        examined = self._screen(predicate, include_faulty)
         rows = replace(rows, sql=cohort_of_rows(signals, examined.cohort).sql)
         overlap = find_training_overlap(
             self.warehouse, self._models.registry, version.manifest, rows
@@ -186,9 +188,7 @@ class FleetEvaluation:
 
         versions = self._versions(model, challengers)
         car = load_car(vehicle, self.warehouse.configs) if isinstance(vehicle, str) else vehicle
-        screen = SensorScreen(cohort)
-        if not include_faulty:
-            screen = screen_computed_drives(self.warehouse, cohort)
+        screen = self._screen(cohort, include_faulty)
         with calls.open_workers(self.warehouse.root, threads) as executor:
             content = evaluate_measured(self.warehouse, versions, screen.cohort, car, executor)
         content |= {"cohort": cohort, **({"examined": str(screen)} if str(screen) else {})}

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import date
+from functools import partial
 from typing import TYPE_CHECKING
 
 from fleet_slip.api import calls
@@ -204,15 +205,9 @@ class FleetMaintenance:
             with recorded_step(root, "accept_losses", accept_loss):
                 accepted = accept_losses(root, accept_loss)
         with calls.open_workers(self.warehouse.root, workers) as executor:
-
-            def verify_all() -> "Verification":
-                return verify(
-                    calls.for_workers(self.warehouse, executor),
-                    full=full,
-                    steps=steps,
-                    executor=calls.remote_executor(executor),
-                )
-
+            warehouse = calls.for_workers(self.warehouse, executor)
+            remote = calls.remote_executor(executor)
+            verify_all = partial(verify, warehouse, full=full, steps=steps, executor=remote)
             result = verify_all()
             if repair:
                 with recorded_step(root, "repair", ()):
