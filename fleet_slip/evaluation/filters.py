@@ -162,14 +162,10 @@ class Filter(NamedTuple):
         self, drives: Sequence[LabelledDrive], car: VehicleParameters, executor: Executor
     ) -> TuningResult[Config]:
         """Return the best parameters over all starts."""
-        module = self.module
-        return min(
-            (
-                tune(module.estimate, start, module.TUNABLE, drives, car, executor)
-                for start in module.STARTS
-            ),
-            key=lambda tuned: tuned.rmse_rad,
-        )
+        estimate, names = self.module.estimate, self.module.TUNABLE
+        starts = self.module.STARTS
+        results = [tune(estimate, start, names, drives, car, executor) for start in starts]
+        return min(results, key=lambda result: result.rmse_rad)
 
 
 FILTERS = (
@@ -234,18 +230,13 @@ def restore_filter(name: str, about: Mapping[str, Any]) -> FilterEstimate:
 
 
 def filter_bank(
-    warehouse: Warehouse,
-    drives: Sequence[LabelledDrive],
-    car: VehicleParameters,
-    executor: Executor,
-    *,
-    with_mass: bool,
+    stored: Mapping[str, Any], drives: Sequence[LabelledDrive], *, with_mass: bool
 ) -> EstimatorBank:
     """Return each filter with default and with tuned parameters, and one in an identified car.
 
-    A filter for which the drives lack a signal is not tuned, and a warning names it.
+    `stored` is of `load_or_tune`. A filter for which the drives lack a signal is not tuned, and a
+    warning names it.
     """
-    stored = load_or_tune(warehouse, drives, car, executor, with_mass=with_mass)
     for failure in stored["failing"]:
         LOGGER.warning("%s", failure)
     bank: EstimatorBank = {}

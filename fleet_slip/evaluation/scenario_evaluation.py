@@ -31,6 +31,7 @@ from fleet_slip.evaluation.filters import (
     FilterEstimate,
     TrainedModels,
     filter_bank,
+    load_or_tune,
     read_tuning_drives,
     train_models,
 )
@@ -60,7 +61,8 @@ def train_competitors(
     with_mass = "mass_kg" in predictor.plan.facts
     drives = read_tuning_drives(warehouse, trained[0].selection.cohort, with_mass=with_mass)
     car = load_scenario("nominal", warehouse.configs).car
-    bank |= filter_bank(warehouse, drives, car, executor, with_mass=with_mass)
+    tuned = load_or_tune(warehouse, drives, car, executor, with_mass=with_mass)
+    bank |= filter_bank(tuned, drives, with_mass=with_mass)
     cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
     line = partial(predict_drive, predictor, cars)
     return trained, bank | combination_bank(drives, line, car, one_car.reference, bank)
