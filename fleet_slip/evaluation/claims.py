@@ -121,11 +121,6 @@ def close_to_nominal(report: ReportData, scenario: str, why: str) -> Finding:
     return Finding(change(report, scenario) < SLIGHT, figure, why)
 
 
-def signal_count(report: ReportData) -> int:
-    """Return the number of signals of the paper's choice."""
-    return len(report.estimators[report.choice]["signals"])
-
-
 @claim("Abstract", "a fleet-trained model beats the one-car model in most cases on other classes")
 def many_vehicles(report: ReportData) -> Finding:
     """Signals of many vehicles can be used to make the estimator."""
@@ -148,7 +143,7 @@ def many_vehicles(report: ReportData) -> Finding:
 @claim("Abstract", f"at most {MAX_MULTIPLICATIONS} multiplications an estimate")
 def little_computation(report: ReportData) -> Finding:
     """The mining is done off line, and an estimate on board takes little computation."""
-    signals = signal_count(report)
+    signals = len(report.estimators[report.choice]["signals"])
     multiplications, additions = dot_product_operations(signals)
     return Finding(
         multiplications <= MAX_MULTIPLICATIONS,
@@ -442,7 +437,7 @@ def commercial_vehicles(report: ReportData) -> Finding:
 @claim("V", f"at most {MAX_MULTIPLICATIONS} coefficients")
 def easily_implemented(report: ReportData) -> Finding:
     """The algorithm is easily implemented, with little computation on line."""
-    signals, version = signal_count(report), report.version
+    signals, version = len(report.estimators[report.choice]["signals"]), report.version
     return Finding(
         signals <= MAX_MULTIPLICATIONS,
         f"an intercept and {signals} coefficients",
