@@ -76,12 +76,10 @@ class CommandGroup(TyperGroup):
         width = max(map(len, COMMANDS))
         text_width = formatter.width - width - 6
         for group, names in GROUPS.items():
-            helps = {
-                name: self.commands[name].get_short_help_str(2 * text_width)
-                for name in names.split()
-            }
+            commands = [self.commands[name] for name in names.split()]
+            helps = [(f"{c.name:<{width}}", c.get_short_help_str(2 * text_width)) for c in commands]
             with formatter.section(group):
-                formatter.write_dl([(f"{name:<{width}}", text) for name, text in helps.items()])
+                formatter.write_dl(helps)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Load the command that runs."""

@@ -148,24 +148,16 @@ def ensure_grams(
 def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list[GramReport]:
     """Update all feature sets that were computed before, except for `unreadable` log files."""
     grams = warehouse.grams.snapshot()
-    catalog = warehouse.catalog
-    identities = {name: catalog.identity(name) for name in warehouse.feature_sets()}
-    computed = {
-        name: identity
-        for name, identity in identities.items()
-        if grams.transaction_version(transaction_name(identity)) is not None
-    }
-    drives = {
-        name: _distinct(grams, identity, "drive_id")
-        for name, identity in computed.items()
-        if catalog.feature_set(name).windows
-    }
     reports = []
-    for name in computed:
+    for name in warehouse.feature_sets():
+        identity = warehouse.catalog.identity(name)
+        if grams.transaction_version(transaction_name(identity)) is None:
+            continue
         paths = None
-        if name in drives:  # windows are computed for the drives that had them, not for all
+        if warehouse.catalog.feature_set(name).windows:  # of the drives that had them, not of all
+            drives = _distinct(grams, identity, "drive_id")
             plain = warehouse.grams.snapshot()
-            paths = set(_distinct(plain, PLAIN, "file", drives[name]).to_pylist())
+            paths = set(_distinct(plain, PLAIN, "file", drives).to_pylist())
         if unreadable:
             active = {file.path for file in warehouse.logs.snapshot().files}
             paths = (active if paths is None else paths).difference(unreadable)
