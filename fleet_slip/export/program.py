@@ -6,7 +6,7 @@
 * **The angle** is a dot product of steps, and missing if one of them is.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -242,22 +242,6 @@ class Program(Steps):
     """A published estimator."""
 
     angle: Angle
-
-
-@dataclass(frozen=True)
-class Car:
-    """Properties of a car: facts as in the metadata of a drive, numbers in counts."""
-
-    facts: Mapping[str, object]
-    numbers: Mapping[str, int]
-
-    def fact_counts(self, program: Program) -> tuple[int | None, ...]:
-        """Return the facts of a program as whole numbers; None: unknown."""
-        return tuple(fact.count(self.facts.get(fact.name)) for fact in program.facts)
-
-    def number_counts(self, program: Program) -> tuple[int | None, ...]:
-        """Return the numbers of a program as counts; None: unknown."""
-        return tuple(self.numbers.get(number.name) for number in program.numbers)
 
 
 def write_program(catalog: Catalog, manifest: Manifest) -> Program:

@@ -16,7 +16,7 @@ from fleet_slip.catalog.definitions import round_number
 from fleet_slip.catalog.signals import COUNT_MAX
 from fleet_slip.columns.lowering import power
 from fleet_slip.errors import InputError
-from fleet_slip.export.program import Car, Input, Program, write_program
+from fleet_slip.export.program import Input, Program, write_program
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
 
@@ -72,11 +72,7 @@ class Estimator:
     ) -> None:
         self._manifest = manifest = manifest.estimate
         self._program = program = compile_program(catalog, manifest)
-        properties = _parse_car(manifest, program, car or {})
-        self.car = {
-            "fact": properties.fact_counts(program),
-            "number": properties.number_counts(program),
-        }
+        self.car = _car_counts(manifest, program, car or {})
         self.columns = tuple(signal.column for signal in program.signals)
         scale_of = {signal.name: float(signal.scale) for signal in program.signals}
         self._terms = [
@@ -212,26 +208,26 @@ class Estimator:
         return window[0]
 
 
-def _parse_car(manifest: Manifest, program: Program, values: Mapping[str, Any]) -> Car:
-    """Return a car with numbers in counts."""
-    numbers = {number.name: number for number in program.numbers}
-    names = {*numbers, *(fact.name for fact in program.facts)}
-    if unused := sorted({*values} - names):
+def _car_counts(
+    manifest: Manifest, program: Program, car: Mapping[str, Any]
+) -> dict[str, tuple[int | None, ...]]:
+    """Return the counts of a car's facts and numbers; None: unknown."""
+    names = {fact.name for fact in program.facts} | {n.name for n in program.numbers}
+    if unused := sorted({*car} - names):
         raise InputError(
             f"{manifest.name} does not use {', '.join(unused)} of a car. It uses: "
             f"{', '.join(sorted(names)) or 'no properties'}."
         )
-    counts = {}
-    for name, number in numbers.items():
-        if values.get(name) is None:
-            continue
+    numbers = []
+    for number in program.numbers:
+        value = car.get(number.name)
         try:
-            value = Fraction(values[name])
+            exact = None if value is None else Fraction(value)
         except (TypeError, ValueError, OverflowError):
-            raise InputError(f"{values[name]!r} is not a number. Give a number.") from None
-        if (count := round_number(value, Fraction(number.grain))) is not None:
-            counts[name] = count
-    return Car({name: value for name, value in values.items() if name not in numbers}, counts)
+            raise InputError(f"{value!r} is not a number. Give a number.") from None
+        numbers.append(None if exact is None else round_number(exact, Fraction(number.grain)))
+    facts = [fact.count(car.get(fact.name)) for fact in program.facts]
+    return {"fact": tuple(facts), "number": tuple(numbers)}
 
 
 def compile_program(catalog: Catalog, manifest: Manifest) -> Program:

@@ -19,11 +19,12 @@ import pytest
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.export.c import c_header, c_source, count_costs
 from fleet_slip.export.c_gram import OnBoard, c_gram_header, c_gram_source, lower
-from fleet_slip.export.program import Car, Program
+from fleet_slip.export.program import Program
 from fleet_slip.export.stepping import Sample
 from fleet_slip.export.templating import c_prefix, field_names
 from fleet_slip.models.manifest import LearnedFrom, Manifest, ModelTerm
 from fleet_slip.models.registry import ModelVersion
+from tests.export.cars import Car
 from tests.export.models import MODELS, model_of
 from tests.support.catalog import CATALOG
 

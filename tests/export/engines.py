@@ -11,9 +11,10 @@ import polars as pl
 
 from fleet_slip.export.files import export_files
 from fleet_slip.export.onnx import UNKNOWN
-from fleet_slip.export.program import Car, Program
+from fleet_slip.export.program import Program
 from fleet_slip.export.stepping import Sample
 from fleet_slip.models.registry import ModelVersion
+from tests.export.cars import Car
 
 
 def open_session(version: ModelVersion, kind: str) -> onnxruntime.InferenceSession:

@@ -13,8 +13,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from fleet_slip.export.program import Car, Program
+from fleet_slip.export.program import Program
 from fleet_slip.export.stepping import Sample
+from tests.export.cars import Car
 
 TICK_S = 0.01
 

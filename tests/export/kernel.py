@@ -8,11 +8,12 @@ import pyarrow as pa
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
-from fleet_slip.export.program import Car, Program
+from fleet_slip.export.program import Program
 from fleet_slip.export.stepping import Sample, valid_counts
 from fleet_slip.grams.compute import counts_of
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
+from tests.export.cars import Car
 
 
 def angles_by_kernel(

@@ -23,12 +23,13 @@ from fleet_slip.evaluation import ekf
 from fleet_slip.evaluation.filter_column import observer_of
 from fleet_slip.evaluation.identify import IdentifiedVehicle, vehicle_with_fit
 from fleet_slip.export.files import export_files
-from fleet_slip.export.program import Car, Program
+from fleet_slip.export.program import Program
 from fleet_slip.export.stepping import Sample
 from fleet_slip.models.manifest import CombinedWithFilter, Manifest, ModelTerm
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.vehicle.parameters import VehicleMeasures
 from fleet_slip.warehouse.warehouse import Warehouse
+from tests.export.cars import Car
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.manifests import manifest
 

@@ -7,9 +7,10 @@ import cantools
 import pytest
 from cantools.database.can.database import Database
 
-from fleet_slip.export.program import Car, Program
+from fleet_slip.export.program import Program
 from fleet_slip.export.stepping import Sample, compile_program
 from fleet_slip.models.registry import ModelVersion
+from tests.export.cars import Car
 from tests.export.kernel import angles_by_kernel
 from tests.export.models import DEFINITIONS, export_texts, hostile_drive, model_of
 from tests.support.catalog import CATALOG, SIGNALS

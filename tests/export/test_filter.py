@@ -26,7 +26,7 @@ from fleet_slip.evaluation.identify import (
 )
 from fleet_slip.export.c import count_costs
 from fleet_slip.export.files import export_files, program_content
-from fleet_slip.export.program import Car, Program
+from fleet_slip.export.program import Program
 from fleet_slip.export.stepping import (
     Estimator,
     Sample,
@@ -37,6 +37,7 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.vehicle.parameters import VehicleMeasures
 from tests.export import plain
+from tests.export.cars import Car
 from tests.export.kernel import angles_by_kernel
 from tests.export.models import (
     BLENDS,

@@ -32,7 +32,7 @@ from fleet_slip.catalog.definitions import (
 from fleet_slip.catalog.features import Feature
 from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.export.files import program_content
-from fleet_slip.export.program import Car, Program
+from fleet_slip.export.program import Program
 from fleet_slip.export.stepping import (
     Estimator,
     Sample,
@@ -41,6 +41,7 @@ from fleet_slip.export.stepping import (
 from fleet_slip.models.manifest import Manifest, ModelTerm
 from fleet_slip.models.registry import ModelVersion
 from tests.export import plain
+from tests.export.cars import Car
 from tests.export.compiled import build_driver, drive, needs_cc
 from tests.export.engines import by_duckdb, by_sqlite, open_session, run_drives
 from tests.export.kernel import angles_by_kernel, angles_of_columns
