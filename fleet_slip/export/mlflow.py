@@ -169,9 +169,9 @@ def parameters(version: ModelVersion) -> dict[str, str]:
 
 def _columns(program: Program) -> dict[str, str]:
     """Return the columns of a row, and their types."""
-    facts = {f.name: "string" if f.name in _TEXTS else "double" for f in program.facts}
-    numbers = {number.name: "double" for number in program.numbers}
-    return {signal.column: "double" for signal in program.signals} | facts | numbers
+    names = [*(s.column for s in program.signals), *(f.name for f in program.facts)]
+    names += [number.name for number in program.numbers]
+    return {name: "string" if name in _TEXTS else "double" for name in names}
 
 
 def _signature(mlflow: Any, program: Program) -> Any:

@@ -273,35 +273,30 @@ class _Writer(Nodes):
             self.do("Slice", longer, *ends, out=self.declare_next(f"ring_{source}", ticks))
         return self._rings[source]
 
-    def _sum(self, *window: int) -> tuple[str, str]:
+    def _sum(self, source: int, ticks: int, limit: int) -> tuple[str, str]:
         """Return the sum of a window and its number of values."""
-        if window not in self._sums:
-            source, ticks, limit = window
-            self._sums[window] = (
-                self._window_sum(source, ticks) if ticks else self._total(source, limit)
+        window = (source, ticks, limit)
+        if window in self._sums:
+            return self._sums[window]
+        if ticks:
+            length = self.program.rings[source] + 1
+            values = self.columns(self._ring(source), length - ticks, length)
+            present = self.do("Not", self.do("Equal", values, UNKNOWN))
+            axis = self.constant([1])
+            total = self.do("ReduceSum", self.do("Where", present, values, 0), axis, keepdims=1)
+            ones = self.do("Cast", present, to=TensorProto.INT64)
+            count = self.do("ReduceSum", ones, axis, keepdims=1)
+        else:
+            before, earlier = (
+                self.declare(f"{name}_{source}_of_{limit}", 1) for name in ("sum", "values")
             )
+            adds = self.do("And", self._is_present(source), self.do("Less", earlier, limit))
+            value = self.do("Where", adds, self._value(source), 0)
+            one_more = self.do("Cast", adds, to=TensorProto.INT64)
+            total = self.do("Add", before, value, out=self.declare_next(before, 1))
+            count = self.do("Add", earlier, one_more, out=self.declare_next(earlier, 1))
+        self._sums[window] = total, count
         return self._sums[window]
-
-    def _total(self, source: int, limit: int) -> tuple[str, str]:
-        total, count = (
-            self.declare(f"{name}_{source}_of_{limit}", 1) for name in ("sum", "values")
-        )
-        adds = self.do("And", self._is_present(source), self.do("Less", count, limit))
-        value = self.do("Where", adds, self._value(source), 0)
-        increment = self.do("Cast", adds, to=TensorProto.INT64)
-        return (
-            self.do("Add", total, value, out=self.declare_next(total, 1)),
-            self.do("Add", count, increment, out=self.declare_next(count, 1)),
-        )
-
-    def _window_sum(self, source: int, ticks: int) -> tuple[str, str]:
-        length = self.program.rings[source] + 1
-        values = self.columns(self._ring(source), length - ticks, length)
-        present = self.do("Not", self.do("Equal", values, UNKNOWN))
-        axis = self.constant([1])
-        total = self.do("ReduceSum", self.do("Where", present, values, 0), axis, keepdims=1)
-        count = self.do("Cast", present, to=TensorProto.INT64)
-        return total, self.do("ReduceSum", count, axis, keepdims=1)
 
     def _angle(self, terms: Sequence[str], present: str, exact: Sequence[Fraction]) -> None:
         intercept, *coefficients = (float(value) for value in exact)
