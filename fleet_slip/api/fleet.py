@@ -397,8 +397,8 @@ class Fleet:
             If the cluster cannot be used.
         """
         from fleet_slip.grams.update import update_grams
+        from fleet_slip.warehouse.database import parse_cohort
         from fleet_slip.warehouse.gram_reader import cohort_files
-        from fleet_slip.warehouse.predicate import parse_cohort
 
         files = None
         if cohort:

@@ -110,7 +110,7 @@ class FleetMaintenance:
             If the predicate is invalid.
         """
         from fleet_slip.calibration.car_calibration import calibrate
-        from fleet_slip.warehouse.predicate import parse_cohort
+        from fleet_slip.warehouse.database import parse_cohort
 
         predicate = parse_cohort(self.warehouse.catalog.signals, cohort)
         return calibrate(self.warehouse, predicate, receivers=True)

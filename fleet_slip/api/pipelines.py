@@ -36,7 +36,7 @@ from fleet_slip.operations.forget import load_retention, marked_models
 from fleet_slip.operations.night import Baseline, NightlyLog, NightReport, NightStep, State
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.runs import step
-from fleet_slip.warehouse.predicate import hash_drive
+from fleet_slip.warehouse.database import hash_drive
 from fleet_slip.warehouse.table_views import connect_tables
 
 if TYPE_CHECKING:

@@ -54,6 +54,7 @@ from fleet_slip.regression.exact import sqrt as sqrt_exact
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.least_squares import ExactSums, drive_term_sums, influence
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
+from fleet_slip.warehouse.database import Predicate, parse_predicate
 from fleet_slip.warehouse.gram_reader import (
     GramReader,
     OpenedGrams,
@@ -61,7 +62,6 @@ from fleet_slip.warehouse.gram_reader import (
     gram_table,
     open_grams,
 )
-from fleet_slip.warehouse.predicate import Predicate, parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 
 # Sums of the drives of each car, from Gram rows read batch by batch.

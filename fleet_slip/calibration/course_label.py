@@ -22,8 +22,8 @@ from fleet_slip.quality.course_relation import COLUMNS
 from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram, GramTable, packed_position
 from fleet_slip.regression.least_squares import ONE, ExactSums, LinearModel, fit
+from fleet_slip.warehouse.database import Predicate
 from fleet_slip.warehouse.gram_reader import GramReader, by_signals, gram_table, open_grams
-from fleet_slip.warehouse.predicate import Predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 
 CourseMoments = Mapping[str, Mapping[str, FloatArray]]

@@ -17,7 +17,7 @@ from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import degrees
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.documents import Document, DocumentFolder, checksum
-from fleet_slip.warehouse.predicate import describe_cohort
+from fleet_slip.warehouse.database import describe_cohort
 from fleet_slip.warehouse.warehouse import Warehouse
 
 BLIND_COLUMNS = 5

@@ -18,8 +18,8 @@ from fleet_slip.catalog.course import AUXILIARY, TURNED
 from fleet_slip.catalog.definitions import CALIBRATION, ParameterFactor
 from fleet_slip.catalog.signals import ALL_DRIVES
 from fleet_slip.regression.gram import GramTable, packed_position, packed_positions
+from fleet_slip.warehouse.database import parse_predicate
 from fleet_slip.warehouse.gram_reader import OpenedGrams, by_signals, gram_table
-from fleet_slip.warehouse.predicate import parse_predicate
 
 # Bias and scale error of the gyroscope are removed from Gram rows of changes, drive by drive.
 #

@@ -30,8 +30,8 @@ from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_hash, by
 from fleet_slip.regression.gram import Gram, GramTable, complete_cases, missing_signals_error
 from fleet_slip.regression.inference import ClusterUnit, DriveMoments
 from fleet_slip.rendering import Remark
+from fleet_slip.warehouse.database import Predicate, parse_cohort
 from fleet_slip.warehouse.gram_reader import HASHES, GramReader, OpenedGrams, open_grams
-from fleet_slip.warehouse.predicate import Predicate, parse_cohort
 from fleet_slip.warehouse.warehouse import Warehouse
 
 # Division of a cohort into folds.

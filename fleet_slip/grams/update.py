@@ -30,7 +30,7 @@ from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.runs import LOGGER, recorded_step
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, Table, TableFile, retrying
-from fleet_slip.warehouse.database import open_database, reading_files
+from fleet_slip.warehouse.database import open_database, parse_cohort, reading_files
 from fleet_slip.warehouse.gram_reader import (
     ONBOARD_PREFIX,
     by_signals,
@@ -42,7 +42,6 @@ from fleet_slip.warehouse.gram_reader import (
     named_files,
     rows_of_set,
 )
-from fleet_slip.warehouse.predicate import parse_cohort
 from fleet_slip.warehouse.warehouse import Warehouse
 
 # The job.

@@ -54,8 +54,8 @@ from fleet_slip.regression.folds import (
 )
 from fleet_slip.regression.least_squares import LinearModel
 from fleet_slip.resources import Configs
+from fleet_slip.warehouse.database import parse_cohort, parse_predicate
 from fleet_slip.warehouse.gram_reader import GramReader, open_grams
-from fleet_slip.warehouse.predicate import parse_cohort, parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 
 

@@ -511,7 +511,7 @@ class Manifest(Config):
 
     def properties(self, on_board: str = "") -> dict[str, str]:
         """Return the content of `show` by name; `on_board` are the costs in a car."""
-        from fleet_slip.warehouse.predicate import describe_cohort  # noqa: PLC0415 - SQL
+        from fleet_slip.warehouse.database import describe_cohort  # noqa: PLC0415 - SQL
 
         figures, trained = self.cross_validation, self.trained_on
         drives = f"{pluralize(trained.drives, 'drive')} of {pluralize(trained.vehicles, 'car')}"

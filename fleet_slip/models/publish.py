@@ -42,8 +42,8 @@ from fleet_slip.models.request import (
 )
 from fleet_slip.models.summary import Selection
 from fleet_slip.rendering import Answer, Part, Remark
+from fleet_slip.warehouse.database import parse_cohort, with_all_drives
 from fleet_slip.warehouse.gram_reader import open_grams
-from fleet_slip.warehouse.predicate import parse_cohort, with_all_drives
 from fleet_slip.warehouse.warehouse import Warehouse
 
 # How a model is trained again: as its champion was, and whether that would change anything.

@@ -23,13 +23,13 @@ from fleet_slip.models.summary import remark_skipped_rows
 from fleet_slip.quality.drive_signals import SPEEDS, is_slow
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
-from fleet_slip.warehouse.database import sql_text
-from fleet_slip.warehouse.predicate import (
+from fleet_slip.warehouse.database import (
     Predicate,
     drive_columns,
     guarded_query,
     parse_cohort,
     row_columns,
+    sql_text,
 )
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.warehouse import Warehouse

@@ -19,7 +19,7 @@ from fleet_slip.models.request import ModelList, Search, SelectionRequest
 from fleet_slip.regression.choice import NestedChoice, Winner
 from fleet_slip.regression.folds import CrossValidation, Figures
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
-from fleet_slip.warehouse.predicate import describe_cohort
+from fleet_slip.warehouse.database import describe_cohort
 
 
 @dataclass(frozen=True)

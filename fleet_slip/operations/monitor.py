@@ -24,7 +24,7 @@ from fleet_slip.quality.peers import thresholds
 from fleet_slip.regression.folds import error_sums, least_squares
 from fleet_slip.regression.gram import Gram
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
-from fleet_slip.warehouse.predicate import Predicate, parse_cohort
+from fleet_slip.warehouse.database import Predicate, parse_cohort
 from fleet_slip.warehouse.warehouse import Warehouse
 
 

@@ -15,7 +15,7 @@ from fleet_slip.rendering import Answer, Part
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.predicate import hash_drive
+from fleet_slip.warehouse.database import hash_drive
 
 if TYPE_CHECKING:
     from fleet_slip.operations.monitor import Chart

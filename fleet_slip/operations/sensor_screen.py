@@ -47,9 +47,7 @@ from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.resources import cache_folder, keep_json
 from fleet_slip.storage.table import Snapshot
-from fleet_slip.warehouse.database import sql_text
-from fleet_slip.warehouse.gram_reader import GramReader, find_backlog
-from fleet_slip.warehouse.predicate import (
+from fleet_slip.warehouse.database import (
     Predicate,
     drive_columns,
     guarded_query,
@@ -57,8 +55,10 @@ from fleet_slip.warehouse.predicate import (
     parse_cohort,
     parse_predicate,
     row_columns,
+    sql_text,
     without_drives,
 )
+from fleet_slip.warehouse.gram_reader import GramReader, find_backlog
 from fleet_slip.warehouse.table_views import (
     connect_tables,
     gram_snapshots,

@@ -42,7 +42,7 @@ from fleet_slip.quality.turning import (
     find_reversed_or_swapped,
     find_swapped_axes,
 )
-from fleet_slip.warehouse.predicate import Predicate, guarded_query
+from fleet_slip.warehouse.database import Predicate, guarded_query
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.warehouse import Warehouse
 

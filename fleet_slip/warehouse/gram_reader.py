@@ -25,7 +25,7 @@ from fleet_slip.errors import DataError, NotComputedError
 from fleet_slip.regression.gram import GramTable, packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot, TableFile
-from fleet_slip.warehouse.predicate import Predicate, guarded_query
+from fleet_slip.warehouse.database import Predicate, guarded_query
 from fleet_slip.warehouse.table_views import gram_snapshots, lock, open_tables
 from fleet_slip.warehouse.warehouse import Warehouse
 

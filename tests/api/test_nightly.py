@@ -20,7 +20,7 @@ from fleet_slip.errors import StorageError, UsageError
 from fleet_slip.operations.night import Baseline, NightlyLog, NightReport
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.predicate import hash_drive, parse_predicate, without_drives
+from fleet_slip.warehouse.database import hash_drive, parse_predicate, without_drives
 from tests.support.cars import counts, drive
 from tests.support.catalog import SIGNALS
 from tests.support.commands import Finished, run_on, start_on, until

@@ -20,9 +20,9 @@ from fleet_slip.calibration.receiver_delay import (
 )
 from fleet_slip.catalog.definitions import DELAY
 from fleet_slip.errors import RefusedError
+from fleet_slip.warehouse.database import parse_predicate
 from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
 from fleet_slip.warehouse.gram_reader import open_grams
-from fleet_slip.warehouse.predicate import parse_predicate
 from tests.support.catalog import SIGNALS
 
 CAMPAIGN = """

@@ -24,7 +24,7 @@ from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.peers import find_repeated, thresholds
 from fleet_slip.regression.gram import Gram
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.warehouse.predicate import parse_predicate
+from fleet_slip.warehouse.database import parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.cars import TICKS, Signals, broken, counts, drive, gram_of, with_course
 from tests.support.catalog import CATALOG, SIGNALS

@@ -15,7 +15,7 @@ from fleet_slip.models.acceptance import load_thresholds
 from fleet_slip.operations import sensor_screen
 from fleet_slip.operations.sensor_screen import QualityReport
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.warehouse.predicate import (
+from fleet_slip.warehouse.database import (
     Predicate,
     describe_cohort,
     hash_drive,

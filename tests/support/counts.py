@@ -17,7 +17,7 @@ from fleet_slip.catalog.features import PLAIN
 from fleet_slip.grams.cohort import Cohort, hash_names
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.least_squares import fit
-from fleet_slip.warehouse.predicate import parse_predicate
+from fleet_slip.warehouse.database import parse_predicate
 from tests.support.catalog import CATALOG, SIGNALS
 
 Matrix = NDArray[Any]

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 import urllib.request
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ from typing import Any
 
 from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
 
-from fleet_slip.storage.objects import client
+from fleet_slip.storage.objects import RETRIES, client
 from tests.support.commands import PATIENCE_S, Finished, run_on, start
 
 ACCESS_KEY = "AKIDFORTESTS"
@@ -38,6 +39,7 @@ class Faults:
 
     Attributes:
         failing: share of the requests that are answered by 500, half of them after they were done.
+            No request fails more often than clients repeat it, so that all get through.
         slow_s: longest time by which an answer is late.
         refuse: methods that are answered by 403.
         access_key: the one that is let in.
@@ -45,6 +47,7 @@ class Faults:
         flipped: share of those answers.
         bytes_per_s: how fast answers to GET of objects come, if not at once.
         seen: requests that came, as METHOD PATH.
+        failures: how often each request, as METHOD PATH QUERY, was answered by 500.
     """
 
     failing: float = 0.0
@@ -55,6 +58,7 @@ class Faults:
     flipped: float = 1.0
     bytes_per_s: float | None = None
     seen: list[str] = field(default_factory=list)
+    failures: Counter[str] = field(default_factory=Counter)
 
 
 class Server:
@@ -121,10 +125,11 @@ class Server:
         if method in faults.refuse:
             return _answer(start, "403 Forbidden", "AccessDenied")
         fate = self._rng.random()
-        if fate < faults.failing / 2:
-            return _answer(start, "500 Internal Server Error", "InternalError")
-        if fate < faults.failing:
-            list(self._served(environ, lambda *_: None))
+        request = f"{method} {environ['PATH_INFO']} {environ['QUERY_STRING']}"
+        if fate < faults.failing and faults.failures[request] < RETRIES:
+            faults.failures[request] += 1
+            if fate >= faults.failing / 2:
+                list(self._served(environ, lambda *_: None))
             return _answer(start, "500 Internal Server Error", "InternalError")
         answer = self._served(environ, start)
         flipping = method == "GET" and re.search(faults.flipping, environ["PATH_INFO"])

@@ -15,8 +15,7 @@ from fleet_slip.models.score import cohort_of_rows, score
 from fleet_slip.operations.monitor import monitor
 from fleet_slip.operations.sensor_screen import examine_drives
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.database import open_database
-from fleet_slip.warehouse.predicate import guarded_query, parse_predicate
+from fleet_slip.warehouse.database import guarded_query, open_database, parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.logs import land, log_rows, random_counts

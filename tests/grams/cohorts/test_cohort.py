@@ -21,7 +21,7 @@ from fleet_slip.grams.cohort import (
 from fleet_slip.grams.update import update_grams
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.inference import DriveMoments
-from fleet_slip.warehouse.predicate import parse_predicate
+from fleet_slip.warehouse.database import parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counts import INPUTS, LABEL, cohort_of, driven, gram_of, rows_of, table_of

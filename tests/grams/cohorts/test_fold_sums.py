@@ -17,8 +17,8 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import VIEWS, connect, needed_views
 from fleet_slip.warehouse import gram_reader
+from fleet_slip.warehouse.database import parse_predicate
 from fleet_slip.warehouse.gram_reader import GramReader
-from fleet_slip.warehouse.predicate import parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.growth_history import write_fleet, write_grams
