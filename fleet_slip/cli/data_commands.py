@@ -359,16 +359,16 @@ def features(
     catalog = fleet_of(context).warehouse.catalog
     if files:
         configs = catalog.configs
-        own, in_use = configs.folder, configs.files()
+        overlay, in_use = configs.folder, configs.files()
         places = {
             name: {
-                "from": "own" if own and str(file).startswith(str(own)) else "shipped",
+                "from": "own" if overlay and str(file).startswith(str(overlay)) else "shipped",
                 "path": str(file),
             }
             for name, file in in_use.items()
             if read_named_file(file)
         }
-        heading = f"own configs: {own or 'none'}\nshipped ones: {folder('configs')}"
+        heading = f"own configs: {overlay or 'none'}\nshipped ones: {folder('configs')}"
         table = TextTable(heading, "file|from", places.items(), "{0}|{1[from]}", text_columns=2)
         print_table(places, json, table)
         return
