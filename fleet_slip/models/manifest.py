@@ -50,7 +50,7 @@ MAX_DIGITS = 4000
 """Maximum number of decimal digits of a number in decimal: Python refuses longer texts."""
 
 _FRACTION = re.compile(
-    r"(-?(?:[0-9]{1,4000}|0x[0-9a-f]{1,30000}))/([0-9]{1,4000}|0x[0-9a-f]{1,30000})"
+    r"(-?[0-9]{1,4000})/([0-9]{1,4000})|(-?0x[0-9a-f]{1,30000})/(0x[0-9a-f]{1,30000})"
 )
 """In decimal, or in hexadecimal: models of hundreds of inputs need it."""
 
@@ -60,7 +60,7 @@ def _exact_fraction(value: Any) -> Fraction:
     if isinstance(value, Fraction):
         return value
     if isinstance(value, str) and (match := _FRACTION.fullmatch(value)):
-        numerator, denominator = (int(number, 0) for number in match.groups())
+        numerator, denominator = (int(number, 0) for number in match.groups() if number)
         if not denominator:
             raise ValueError("is divided by zero")
         return Fraction(numerator, denominator)
