@@ -39,7 +39,7 @@ class Faults:
 
     Attributes:
         failing: share of the requests that are answered by 500, half of them after they were done.
-            No request fails more often than clients repeat it, so that all get through.
+            Below 1, no request fails more often than clients repeat it: all get through.
         slow_s: longest time by which an answer is late.
         refuse: methods that are answered by 403.
         access_key: the one that is let in.
@@ -126,7 +126,8 @@ class Server:
             return _answer(start, "403 Forbidden", "AccessDenied")
         fate = self._rng.random()
         request = f"{method} {environ['PATH_INFO']} {environ['QUERY_STRING']}"
-        if fate < faults.failing and faults.failures[request] < RETRIES:
+        is_certain = faults.failing >= 1
+        if fate < faults.failing and (is_certain or faults.failures[request] < RETRIES):
             faults.failures[request] += 1
             if fate >= faults.failing / 2:
                 list(self._served(environ, lambda *_: None))
