@@ -25,14 +25,12 @@ import struct
 import sysconfig
 import tempfile
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass
-from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import polars as pl
 
@@ -68,7 +66,8 @@ FORMATS = {
     "can_trace": Format("a BLF file", (b"LOGG",), (".blf",), "can", ("can", "cantools")),
 }
 """Each has `open_FORMAT` in its module."""
-SIZES = struct.Struct("<QQ")
+SIZES, ROWS = struct.Struct("<QQ"), b'["rows", '
+"""How an answer begins, and the question for rows."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def serve(control: int) -> None:
                 asking.close()
                 try:
                     with socket.socket(fileno=descriptors[0]) as channel:
-                        _Reader(channel).serve(parent)
+                        _answer_questions(channel, parent)
                 finally:
                     os._exit(0)
             os.close(descriptors[0])
@@ -119,61 +118,39 @@ def serve(control: int) -> None:
 
 
 class _Reader:
-    """An open file, the caller's socket, and the batches that are being read."""
+    """Answers questions on a file, each a method."""
 
-    def __init__(self, channel: socket.socket) -> None:
-        self._channel = channel
+    def __init__(self, job: Job, opened: contextlib.ExitStack) -> None:
+        self._job, self._opened = job, opened
         self._source: Source
         self._batches: list[Iterator[pl.DataFrame]] = []
-        self._ahead: dict[int, Future[pl.DataFrame | None] | None] = {}
 
-    def serve(self, parent: int) -> None:
-        """Confine this process to a file and answer questions on it."""
-        with self._channel.makefile("rb") as requests, contextlib.ExitStack() as opened:
-            job: Job = pickle.load(requests)  # noqa: S301 - of our own parent
-            os.chdir(job.cwd)
-            tempfile.tempdir = job.folder
-            confine(parent, job)
-            file = os.fspath(job.budget.file)
-
-            def open_it() -> bool:
-                source = open_here(job.format, job.budget, job.formats)
-                self._source = opened.enter_context(source)
-                return self._source.has_clock
-
-            if not self._answer(file, open_it):
-                return
-            for line in requests:
-                name, *arguments = json.loads(line)
-                self._answer(file, partial(getattr(self, name), *arguments))
-                if name == "rows":
-                    self._look_ahead(*arguments)
-
-    def _answer(self, file: str, find: Callable[[], Any]) -> bool:
-        """Send the result of a function, or its error. Returns False for an error."""
+    def answer(self, question: bytes) -> bytes:
+        """Return sizes, JSON and rows: the result of a method, or its error."""
+        rows = io.BytesIO()
+        name, *arguments = json.loads(question)
         try:
-            answer = find()
-            if isinstance(answer, pl.DataFrame):
-                names = {name: str(place) for place, name in enumerate(answer.columns)}
-                self._send({"found": [*names]}, answer.rename(names))  # Arrow cuts names at a NUL
-            else:
-                self._send({"found": answer})
+            result = getattr(self, name)(*arguments)
+            if isinstance(result, pl.DataFrame):
+                names = {name: str(place) for place, name in enumerate(result.columns)}
+                frame, result = result.rename(names), [*names]  # Arrow cuts names at a NUL
+                frame.write_ipc_stream(rows, compat_level=pl.CompatLevel.oldest())
+            content = {"found": result}
         except Exception as error:
             kind, text = type(error).__name__, str(error)
             if is_lack_of_memory(error) or getattr(error, "errno", 0) == errno.EFBIG:
                 kind = "MemoryError"
             elif not isinstance(error, FleetSlipError):
-                text = str(unreadable(file, error))
-            self._send({"error": kind, "text": text})
-            return False
-        return True
+                text = str(unreadable(self._job.budget.file, error))
+            content = {"error": kind, "text": text}
+        line = json.dumps(content).encode()
+        return SIZES.pack(len(line), rows.tell()) + line + rows.getbuffer()
 
-    def _send(self, answer: Any, frame: pl.DataFrame | None = None) -> None:
-        line, rows = json.dumps(answer).encode(), io.BytesIO()
-        if frame is not None:
-            frame.write_ipc_stream(rows, compat_level=pl.CompatLevel.oldest())
-        self._channel.sendall(SIZES.pack(len(line), rows.tell()) + line)
-        self._channel.sendall(rows.getbuffer())
+    def open(self) -> bool:
+        """Open the file. Returns True if it has clocks."""
+        source = open_here(self._job.format, self._job.budget, self._job.formats)
+        self._source = self._opened.enter_context(source)
+        return self._source.has_clock
 
     def channels(self) -> list[tuple[str, ...]]:
         """Return all that can be read."""
@@ -191,19 +168,24 @@ class _Reader:
 
     def rows(self, number: int) -> pl.DataFrame | None:
         """Return the next rows of a time base, None if there are no more."""
-        ahead = self._ahead.get(number)
-        return next(self._batches[number], None) if ahead is None else ahead.result()
+        return next(self._batches[number], None)
 
-    def _look_ahead(self, number: int) -> None:
-        """Read the next rows while the other process handles the last ones."""
-        if number not in self._ahead:  # many want the first rows alone
-            self._ahead[number] = None
-            return
-        ahead = self._ahead[number] = Future()
-        try:
-            ahead.set_result(next(self._batches[number], None))
-        except Exception as error:
-            ahead.set_exception(error)
+
+def _answer_questions(channel: socket.socket, parent: int) -> None:
+    """Confine this process to a file and answer questions on it.
+
+    The next rows are read while the other process handles the last ones.
+    """
+    with channel.makefile("rb") as questions, contextlib.ExitStack() as opened:
+        job: Job = pickle.load(questions)  # noqa: S301 - of our own parent
+        os.chdir(job.cwd)
+        tempfile.tempdir = job.folder
+        confine(parent, job)
+        reader, ahead = _Reader(job, opened), dict[bytes, bytes]()
+        for question in questions:
+            channel.sendall(ahead.pop(question, b"") or reader.answer(question))
+            if question.startswith(ROWS):
+                ahead[question] = reader.answer(question)
 
 
 # Restrictions of a reader by the kernel.
@@ -215,8 +197,11 @@ _RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15}
 """Number of rights on files by version of Landlock; later versions have 16."""
 _READ_FILE, _READ = 1 << 2, 1 << 2 | 1 << 3
 _EVERYTHING_HERE = (1 << 13) - 1
-_OURS = (str(Path(__file__).parents[2]),)
-_TIME_ZONES = ("/etc/localtime", "/usr/share/zoneinfo")
+_READABLE = (
+    *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+    *(str(Path(__file__).parents[2]), "/usr/share/zoneinfo"),
+)
+"""Folders of code and time zones, which contain no private data."""
 
 _COMMANDS = {
     "fcntl": (8, 10, 15),  # F_SETOWN, F_SETSIG, F_SETOWN_EX
@@ -241,19 +226,19 @@ def confine(parent: int, job: Job) -> None:
         os._exit(1)
     Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    _limit(resource.RLIMIT_AS, pages * resource.getpagesize() + job.budget.memory)
-    _limit(resource.RLIMIT_FSIZE, job.budget.unfolded)
-    _limit(resource.RLIMIT_CPU, int(10 * job.budget.seconds) + 1)
-    _limit(resource.RLIMIT_CORE, 0)
+    limits = {
+        resource.RLIMIT_AS: pages * resource.getpagesize() + job.budget.memory,
+        resource.RLIMIT_FSIZE: job.budget.unfolded,
+        resource.RLIMIT_CPU: int(10 * job.budget.seconds) + 1,
+        resource.RLIMIT_CORE: 0,
+    }
+    for kind, limit in limits.items():
+        hard = resource.getrlimit(kind)[1]
+        both = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+        resource.setrlimit(kind, (both, both))
     _call(_LIBC.prctl(_NO_NEW_PRIVS, 1, 0, 0, 0))
     _close_files(os.fspath(job.budget.file), job.folder)
     _forbid_calls()
-
-
-def _limit(kind: int, limit: int) -> None:
-    _, hard = resource.getrlimit(kind)
-    limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
-    resource.setrlimit(kind, (limit, limit))
 
 
 def _close_files(file: str, folder: str) -> None:
@@ -265,9 +250,10 @@ def _close_files(file: str, folder: str) -> None:
     ports, beyond = 3 if version >= 4 else 0, 3 if version >= 6 else 0
     attributes = struct.pack("QQQ", handled, ports, beyond)
     rules = _call(_LIBC.syscall(_CREATE_RULESET, attributes, len(attributes), 0))
+    allowed = dict.fromkeys(_READABLE, _READ)
     # For the folder: all rights of the first version, and truncating files.
-    allowed = {file: _READ_FILE, folder: (_EVERYTHING_HERE | 1 << 14) & handled}
-    for place, rights in {**dict(_readable()), **allowed}.items():
+    allowed |= {file: _READ_FILE, folder: (_EVERYTHING_HERE | 1 << 14) & handled}
+    for place, rights in allowed.items():
         try:
             opened = os.open(place, os.O_PATH | os.O_CLOEXEC)
         except OSError:
@@ -277,13 +263,6 @@ def _close_files(file: str, folder: str) -> None:
         os.close(opened)
     _call(_LIBC.syscall(_RESTRICT_SELF, rules, 0))
     os.close(rules)
-
-
-def _readable() -> Iterator[tuple[str, int]]:
-    """Yield the paths of code and time zones, which contain no private data."""
-    code = (sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
-    for place in (*code, *_OURS, *_TIME_ZONES):
-        yield place, _READ if Path(place).is_dir() else _READ_FILE
 
 
 def _forbid_calls() -> None:

@@ -3,19 +3,16 @@
 import csv
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from io import BufferedReader, BytesIO
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
-import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from fleet_slip.base import quote_name
-from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.file_formats import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.source import Budget, Channel, Source, find_column
 
@@ -79,18 +76,32 @@ class CsvSource(Source):
 
     def __init__(self, budget: Budget, csv_format: CsvFormat, numbers: PlainNumbers) -> None:
         """Take a file and how it is written; it is opened to be read."""
-        self._file, self._budget = budget.file, budget
-        self.csv_format, self._numbers = csv_format, numbers
+        self._budget, self.csv_format, self._numbers = budget, csv_format, numbers
 
     @cached_property
     def _header(self) -> list[Channel]:
-        with self._file.open("rb") as stream:
+        with self._budget.file.open("rb") as stream:
             return self._read_header(text_of(stream, self.csv_format))
 
     def _read_header(self, stream: BinaryIO) -> list[Channel]:
         """Return all columns, and leave the stream where the data begin. Raises `InputError`."""
-        names = _csv_header(stream, self._file, self.csv_format)
-        return described(names)
+        layout = self.csv_format
+        for _ in range(layout.header_line - 1):
+            stream.readline(MAX_LINE_BYTES)
+        line = stream.readline(MAX_LINE_BYTES + 1)
+        fields = None
+        if line.strip() and len(line) <= MAX_LINE_BYTES:
+            text = _decode(line.removeprefix(b"\xef\xbb\xbf"), self._budget).rstrip("\r\n")
+            fields = _fields(text, layout)
+        if fields is None:
+            raise self._budget.error(
+                f"its line {layout.header_line} is no header of CSV: it is empty, has an open "
+                f"quote, or is longer than {MAX_LINE_BYTES:,} bytes. Export it again, or set "
+                "header_line under [csv] in the mapping."
+            )
+        for _ in range(layout.header_line + 1, layout.data_line or 0):
+            stream.readline(MAX_LINE_BYTES)
+        return described(fields)
 
     def channels(self) -> list[Channel]:
         """Return the columns of the header."""
@@ -98,18 +109,14 @@ class CsvSource(Source):
 
     def find(self, column: str) -> tuple[str, int]:
         """Return the position of a column. Raises `InputError`."""
-        return "", find_column(self._file, [channel.name for channel in self._header], column)
-
-    def _cleaned(self, lines: bytes) -> bytes:
-        """Return lines with the separators of CSV."""
-        return lines
+        return "", find_column(self._budget.file, [c.name for c in self._header], column)
 
     def read(self, _base: str, places: dict[str, int]) -> Iterator[pl.DataFrame]:
         """Yield the columns as text or plain numbers, and `EXTRA_FIELDS`.
 
         A line that repeats the header, in any order, gives the places of the columns behind it.
         """
-        with self._file.open("rb") as stream:
+        with self._budget.file.open("rb") as stream:
             plain = text_of(stream, self.csv_format)
             names = [channel.name for channel in self._read_header(plain)]
             numbers, unfolded = set(self._numbers.columns & set(places)), 0
@@ -119,9 +126,10 @@ class CsvSource(Source):
                 unfolded += len(block)
                 self._budget.require_unfolded(unfolded)
                 for lines, header in self._split_at_headers(block, names):
-                    yield self._parse_lines(lines, len(names), places, numbers)
+                    yield self._parse(lines, len(names), places, numbers)
                     if header:
-                        places = {name: find_column(self._file, header, name) for name in places}
+                        file = self._budget.file
+                        places = {name: find_column(file, header, name) for name in places}
                         names = header
 
     def _blocks(self, stream: BinaryIO, width: int) -> Iterator[bytes]:
@@ -131,19 +139,18 @@ class CsvSource(Source):
             block = remainder + more
             end = _end_of_lines(block)
             if not end and len(block) > LINE_BLOCKS * BLOCK_BYTES:
-                raise InputError(
-                    f"{quote_name(self._file)}: a line is longer than "
-                    f"{LINE_BLOCKS * BLOCK_BYTES:,} bytes. Is a quote not closed?"
+                raise self._budget.error(
+                    f"a line is longer than {LINE_BLOCKS * BLOCK_BYTES:,} bytes. Is a quote not "
+                    "closed?"
                 )
-            remainder = block[end:]
-            if end:
-                lines = self._cleaned(block[:end])
-                _require_text(lines, self._file)
+            lines, remainder = block[:end], block[end:]
+            if lines:
+                _decode(lines, self._budget)
                 before = lines[lines.rfind(b"\n", 0, -1) + 1 :]
                 yield lines
         if remainder:
-            _require_text(remainder, self._file)
-            yield self._with_cut_marked(self._cleaned(remainder), before, width)
+            _decode(remainder, self._budget)
+            yield self._with_cut_marked(remainder, before, width)
 
     def _with_cut_marked(self, line: bytes, before: bytes, width: int) -> bytes:
         """Return the last line, with `CUT` in `EXTRA_FIELDS` if it has fewer fields than others."""
@@ -165,10 +172,10 @@ class CsvSource(Source):
         fields = 1 + max((row.count(separator) for row in rows), default=0)
         width = max((number for number, name in enumerate(names, 1) if name), default=0)
         if len(rows) > 1 and fields < width:
-            raise InputError(
-                f"{quote_name(self._file)}: its header has {width} names, and its rows have "
-                f"{fields} fields, so that values may belong to other columns. Correct the header, "
-                "or set header_line and separator under [csv] in the mapping."
+            raise self._budget.error(
+                f"its header has {width} names, and its rows have {fields} fields, so that values "
+                "may belong to other columns. Correct the header, or set header_line and separator "
+                "under [csv] in the mapping."
             )
 
     def _split_at_headers(
@@ -189,65 +196,37 @@ class CsvSource(Source):
             place = block.find(probe, end)
         yield block[start:], None
 
-    def _parse_lines(
+    def _parse(
         self, block: bytes, width: int, places: dict[str, int], numbers: set[str]
     ) -> pl.DataFrame:
-        """Parse lines; remove columns with other values from `numbers`."""
+        """Parse lines; remove columns with other values from `numbers`.
+
+        Columns are read by position: Polars renames doubles. A line of separators before them fixes
+        the number of fields, and keeps a block from looking like a compressed file.
+        """
         # Reading on over bad numbers is reading on over bad quotes. Beside a decimal comma a point
         # groups digits, but Polars reads it as one.
         grouped = self.csv_format.decimal_comma and b"." in block
-        fit = frozenset() if b'"' in block or grouped else frozenset(numbers)
-        parsed = self._parse(block, width, places, fit)
-        texts = {name for name in fit if not self._numbers.are_in(parsed[name])}
-        if texts:
-            numbers.difference_update(texts)  # so that others need not be parsed twice
-            again = self._parse(block, width, {n: places[n] for n in texts}, set())
-            parsed = parsed.with_columns(again.select(sorted(texts)))
-        return parsed
-
-    def _parse(
-        self, block: bytes, width: int, positions: dict[str, int], numbers: Set[str]
-    ) -> pl.DataFrame:
-        """Parse lines. Columns are read by position: Polars renames doubles.
-
-        A line of separators before them fixes the number of fields, and keeps a block from looking
-        like a compressed file.
-        """
+        parsed_numbers = set[str]() if b'"' in block or grouped else numbers
         padding = self.csv_format.separator.encode() * width + b"\n"
         fields = [f"column {i}" for i in range(width)] + [EXTRA_FIELDS]
         schema: dict[str, type[pl.DataType]] = dict.fromkeys(fields, pl.String)
-        schema |= {fields[positions[name]]: pl.Float64 for name in numbers}
+        schema |= {fields[places[name]]: pl.Float64 for name in parsed_numbers}
         frame = pl.scan_csv(
             BytesIO(padding + block),
             has_header=False,
             separator=self.csv_format.separator,
             schema=schema,
             truncate_ragged_lines=True,
-            ignore_errors=bool(numbers),
+            ignore_errors=bool(parsed_numbers),
             decimal_comma=self.csv_format.decimal_comma,
         )
-        selection = [pl.col(fields[i]).alias(name) for name, i in positions.items()]
-        return frame.select(*selection, EXTRA_FIELDS).collect().slice(1)
-
-
-def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str]:
-    """Return the names of the columns, and leave the stream where the data begin."""
-    for _ in range(csv_format.header_line - 1):
-        stream.readline(MAX_LINE_BYTES)
-    line = stream.readline(MAX_LINE_BYTES + 1)
-    names = None
-    if line.strip() and len(line) <= MAX_LINE_BYTES:
-        text = _decode(line.removeprefix(b"\xef\xbb\xbf"), file).rstrip("\r\n")
-        names = _fields(text, csv_format)
-    if names is None:
-        raise InputError(
-            f"{quote_name(file)}: its line {csv_format.header_line} is no header of CSV: it is "
-            f"empty, has an open quote, or is longer than {MAX_LINE_BYTES:,} bytes. Export it "
-            "again, or set header_line under [csv] in the mapping."
-        )
-    for _ in range(csv_format.header_line + 1, csv_format.data_line or 0):
-        stream.readline(MAX_LINE_BYTES)
-    return names
+        selection = [pl.col(fields[i]).alias(name) for name, i in places.items()]
+        parsed = frame.select(*selection, EXTRA_FIELDS).collect().slice(1)
+        if texts := {name for name in parsed_numbers if not self._numbers.are_in(parsed[name])}:
+            numbers -= texts
+            return self._parse(block, width, places, numbers)
+        return parsed
 
 
 _WITH_KEYS = re.compile(r'"?([^"|]+)"?\|"?([^"|]*)"?(\|[-+.\d]*){1,3}')
@@ -282,28 +261,24 @@ def _fields(line: str, csv_format: CsvFormat) -> list[str] | None:
 def _end_of_lines(block: bytes) -> int:
     """Return where the last whole line ends: behind a line break with no open quote before it."""
     end = block.rfind(b"\n") + 1
-    if b'"' not in block or block.count(b'"', 0, end) % 2 == 0:
-        return end
-    characters = np.frombuffer(block[:end], dtype=np.uint8)
-    open_quote = np.logical_xor.accumulate(characters == ord('"'))
-    ends = np.flatnonzero((characters == ord("\n")) & ~open_quote)
-    return int(ends[-1]) + 1 if ends.size else 0
+    quotes = block.count(b'"', 0, end)
+    while quotes % 2:
+        before = block.rfind(b"\n", 0, end - 1) + 1
+        quotes -= block.count(b'"', before, end)
+        end = before
+    return end
 
 
-def _require_text(block: bytes, file: Path) -> None:
-    if b"\0" in block or not block.isascii():
-        _decode(block, file)
-
-
-def _decode(block: bytes, file: Path) -> str:
-    advice = (
-        "Write encoding under [csv] in the mapping: 'cp1252' of Western Windows, or 'utf-16'; or "
-        "give a Parquet file."
+def _decode(block: bytes, budget: Budget) -> str:
+    """Return text of UTF-8. Raises `InputError`."""
+    problem = "binary or UTF-16, not a UTF-8 CSV file"
+    if b"\0" not in block:
+        try:
+            return block.decode("utf-8")
+        except UnicodeDecodeError as error:
+            near = block[error.start - min(error.start, 20) : error.start + 20]
+            problem = f"not UTF-8, near {near!r}"
+    raise budget.error(
+        f"{problem}. Write encoding under [csv] in the mapping: 'cp1252' of Western Windows, or "
+        "'utf-16'; or give a Parquet file."
     )
-    if b"\0" in block:
-        raise InputError(f"{quote_name(file)}: binary or UTF-16, not a UTF-8 CSV file. {advice}")
-    try:
-        return block.decode("utf-8")
-    except UnicodeDecodeError as error:
-        line = block[error.start - min(error.start, 20) : error.start + 20]
-        raise InputError(f"{quote_name(file)}: not UTF-8, near {line!r}. {advice}") from None

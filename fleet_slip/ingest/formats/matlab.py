@@ -10,17 +10,15 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 
-from fleet_slip.base import quote_name
-from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import (
     MAX_COLUMNS,
+    OWN_TIME,
     Budget,
     Channel,
     Source,
@@ -49,99 +47,48 @@ WINDOW_ROWS = 2**17
 
 @dataclass(frozen=True)
 class Vector:
-    """The values of a signal; `base` identifies their times, where the file has them.
+    """The values of a signal.
 
-    Neither MATLAB nor HDF5 has titles and units, but structs of recorders do.
+    Neither MATLAB nor HDF5 has titles and units, but structs of recorders do. A waveform has times:
+    of its first value in s, and the step to each next one.
     """
 
     rows: int
     read: Callable[[slice], Any]
     title: str = ""
     unit: str = ""
-    base: str = ""
+    times: tuple[float, float] | None = None
 
-
-def _vectors_of(path: str, values: Any, title: str, unit: str) -> dict[str, Vector]:
-    """Return the signals of an array of HDF5, with the axes of MATLAB reversed, by name."""
-    axes = [axis for axis, size in enumerate(values.shape) if size != 1]
-    sizes = [values.shape[axis] for axis in axes]
-    if 0 in sizes:
-        return {}
-    if len(axes) == 1:
-        return {path: Vector(sizes[0], partial(_take, values, {}, axes[0]), title, unit)}
-    if len(axes) != 2 or min(sizes) > _MAX_SIGNALS:
-        return {}
-    is_wide = sizes[0] > _MAX_SIGNALS
-    long, across = (0, 1) if is_wide else (1, 0)
-    name = path + ("({},:)" if is_wide else "(:,{})")
-    return {
-        name.format(number + 1): Vector(
-            sizes[long], partial(_take, values, {axes[across]: number}, axes[long]), title, unit
-        )
-        for number in range(sizes[across])
-    }
-
-
-def _take(values: Any, fixed: Mapping[int, int], axis: int, rows: slice) -> Any:
-    return values[tuple(rows if n == axis else fixed.get(n, 0) for n in range(values.ndim))]
+    @property
+    def base(self) -> str:
+        """Identifies the times of a waveform."""
+        return f"{self.rows} times {self.times}" if self.times else ""
 
 
 class Vectors(Source):
-    """The vectors of an open file. Time is one of them."""
+    """The vectors of an open file. Time is one of them, except of waveforms."""
 
-    def __init__(self, file: Path, vectors: Mapping[str, Any], refused: Mapping[str, str]) -> None:
-        """Take its vectors by name, and why others are not read."""
-        self._file, self._vectors, self._refused = file, vectors, refused
-
-    def channels(self) -> list[Channel]:
-        """Return all vectors."""
-        return [
-            Channel(name, vector.unit, vector.base or f"{vector.rows} rows", vector.title)
-            for name, vector in self._vectors.items()
-        ]
-
-    def unreadable(self) -> list[str]:
-        """Return why parts of the file are not read."""
-        return [f"{path!r} {why}" for path, why in self._refused.items()]
-
-    def find(self, column: str) -> tuple[str, Any]:
-        """Return the time base of a vector, and the vector. Raises `InputError`."""
-        if column in self._vectors:
-            return self._vectors[column].base, self._vectors[column]
-        for path, why in self._refused.items():
-            if f"{column}.".startswith(f"{path}."):
-                raise InputError(f"{quote_name(self._file)}: {column!r} {why}")
-        raise missing_column(self._file, column, [*self._vectors])
-
-    def read(self, _base: str, vectors: dict[str, Any]) -> Iterator[pl.DataFrame]:
-        """Yield all rows, some at once. Raises `InputError` if columns differ in length."""
-        first, rows = next((name, vector.rows) for name, vector in vectors.items())
-        for name, vector in vectors.items():
-            if vector.rows != rows:
-                raise InputError(
-                    f"{quote_name(self._file)}: {name!r} has {vector.rows:,} values and {first!r} "
-                    f'has {rows:,}. Give the signal the time that goes with it: time = "…".'
-                )
-        for start in range(0, max(rows, 1), WINDOW_ROWS):
-            window = slice(start, min(start + WINDOW_ROWS, rows))
-            yield pl.DataFrame(
-                as_column(self._file, name, np.asarray(vector.read(window))).alias(name)
-                for name, vector in vectors.items()
-            )
-
-
-class _Content:
-    """The vectors of a file by name, and why others are not read."""
-
-    def __init__(self) -> None:
+    def __init__(self, budget: Budget) -> None:
+        """Begin without vectors, by name, and without reasons why others are not read."""
+        self._budget = budget
         self.vectors: dict[str, Vector] = {}
         self.refused: dict[str, str] = {}
 
     def add_array(self, path: str, values: Any, title: str = "", unit: str = "") -> None:
-        """Add the signals of an array."""
-        signals = _vectors_of(path, values, title, unit)
-        self.vectors |= signals
-        if not signals and math.prod(values.shape) > 1:
+        """Add the signals of an array of HDF5, with the axes of MATLAB reversed."""
+        axes = [axis for axis, size in enumerate(values.shape) if size != 1]
+        sizes = [values.shape[axis] for axis in axes]
+        if len(axes) == 1 and sizes[0]:
+            read = partial(_take, values, {}, axes[0])
+            self.vectors[path] = Vector(sizes[0], read, title, unit)
+        elif len(axes) == 2 and 0 < min(sizes) <= _MAX_SIGNALS:
+            is_wide = sizes[0] > _MAX_SIGNALS
+            long, across = (0, 1) if is_wide else (1, 0)
+            for number in range(sizes[across]):
+                name = f"{path}({number + 1},:)" if is_wide else f"{path}(:,{number + 1})"
+                read = partial(_take, values, {axes[across]: number}, axes[long])
+                self.vectors[name] = Vector(sizes[long], read, title, unit)
+        elif math.prod(values.shape) > 1:
             shape = " x ".join(map(str, reversed(values.shape)))
             self.refused[path] = f"has {shape} values, not one a row. Save its signals as vectors."
 
@@ -162,6 +109,50 @@ class _Content:
             elif type(value).__name__ == "MatlabOpaque" or name == "None":
                 self.refused[path] = _OBJECT.format("object")
 
+    def channels(self) -> list[Channel]:
+        """Return all vectors."""
+        return [
+            Channel(name, vector.unit, vector.base or f"{vector.rows} rows", vector.title)
+            for name, vector in self.vectors.items()
+        ]
+
+    def unreadable(self) -> list[str]:
+        """Return why parts of the file are not read."""
+        return [f"{path!r} {why}" for path, why in self.refused.items()]
+
+    def find(self, column: str) -> tuple[str, Vector]:
+        """Return the time base of a vector, and the vector. Raises `InputError`."""
+        if column in self.vectors:
+            return self.vectors[column].base, self.vectors[column]
+        for path, why in self.refused.items():
+            if f"{column}.".startswith(f"{path}."):
+                raise self._budget.error(f"{column!r} {why}")
+        raise missing_column(self._budget.file, column, [*self.vectors])
+
+    def read(self, _base: str, vectors: dict[str, Vector]) -> Iterator[pl.DataFrame]:
+        """Yield all rows, some at once. Raises `InputError` if columns differ in length."""
+        first, vector = next(iter(vectors.items()))
+        for name, other in vectors.items():
+            if other.rows != vector.rows:
+                raise self._budget.error(
+                    f"{name!r} has {other.rows:,} values and {first!r} has {vector.rows:,}. Give "
+                    'the signal the time that goes with it: time = "…".'
+                )
+        for start in range(0, max(vector.rows, 1), WINDOW_ROWS):
+            window = slice(start, min(start + WINDOW_ROWS, vector.rows))
+            columns = {
+                name: as_column(self._budget.file, name, np.asarray(other.read(window)))
+                for name, other in vectors.items()
+            }
+            if vector.times:
+                start_s, step_s = vector.times
+                columns[OWN_TIME] = pl.Series(start_s + step_s * np.arange(start, window.stop))
+            yield pl.DataFrame(columns)
+
+
+def _take(values: Any, fixed: Mapping[int, int], axis: int, rows: slice) -> Any:
+    return values[tuple(rows if n == axis else fixed.get(n, 0) for n in range(values.ndim))]
+
 
 @contextmanager
 def open_mat(budget: Budget, _formats: FileFormats) -> Iterator[Vectors]:
@@ -176,9 +167,9 @@ def open_mat(budget: Budget, _formats: FileFormats) -> Iterator[Vectors]:
     variables = {name: value for name, value in file.items() if not name.startswith("__")}
     if "__function_workspace__" in file:
         variables["None"] = None
-    content = _Content()
-    content.add_struct(variables)
-    yield Vectors(budget.file, content.vectors, content.refused)
+    vectors = Vectors(budget)
+    vectors.add_struct(variables)
+    yield vectors
 
 
 @contextmanager
@@ -190,7 +181,7 @@ def _open_hdf5(budget: Budget) -> Iterator[Vectors]:
     not followed.
     """
     h5py = load_library(budget.file, "h5py")
-    content = _Content()
+    content = Vectors(budget)
 
     def add(name: str, item: Any) -> None:
         """Add a dataset, or those that it refers to: elements of a cell, or fields of structs."""
@@ -198,9 +189,8 @@ def _open_hdf5(budget: Budget) -> Iterator[Vectors]:
             return
         layout = item.id.get_create_plist()
         if layout.get_external_count() or layout.get_layout() == h5py.h5d.VIRTUAL:
-            raise InputError(
-                f"{quote_name(budget.file)}: the values of {name!r} are in other files. Export it "
-                "again with all values in one file."
+            raise budget.error(
+                f"the values of {name!r} are in other files. Export it again with all in one file."
             )
         kind = item.attrs.get("MATLAB_class", b"double")
         kind = kind.decode("latin-1") if isinstance(kind, bytes) else str(kind)
@@ -230,7 +220,7 @@ def _open_hdf5(budget: Budget) -> Iterator[Vectors]:
     with h5py.File(budget.file, "r") as root:
         root.visititems(visit)
         root.visititems_links(note_link)
-        yield Vectors(budget.file, content.vectors, content.refused)
+        yield content
 
 
 _OBJECTS = {"table", "timetable", "timeseries", "datetime", "duration", "categorical", "string"}

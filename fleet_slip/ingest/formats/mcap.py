@@ -6,7 +6,6 @@ read once for its topics, and once more for each topic with columns of a mapping
 """
 
 import json
-import re
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,8 +15,6 @@ from typing import Any
 
 import polars as pl
 
-from fleet_slip.base import quote_name
-from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import (
     OWN_TIME,
@@ -35,54 +32,29 @@ PIECE_ROWS = 2**13
 """Messages of a topic that are in memory at once."""
 
 
-def leaves_of(value: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+def leaves_of(value: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str, float | str]]:
     """Yield the numbers and texts in a message, with their paths."""
-    if isinstance(value, bool | int | float | str):
+    if isinstance(value, str):
         yield path, value
+    elif isinstance(value, bool | int | float):
+        yield path, float(value)
     elif depth < _DEEPEST:
-        below: list[tuple[str, Any]]
         if isinstance(value, list | tuple | array):
-            below = [(f"[{number}]", item) for number, item in enumerate(value[:_MAX_ITEMS])]
+            below = {f"{path}[{number}]": item for number, item in enumerate(value[:_MAX_ITEMS])}
         else:
             names = value if isinstance(value, dict) else getattr(type(value), "__slots__", ())
             members = value if isinstance(value, dict) else {n: getattr(value, n) for n in names}
-            below = [(f".{name}" if path else str(name), members[name]) for name in names]
-        for name, item in below:
-            yield from leaves_of(item, path + name, depth + 1)
+            below = {f"{path}.{name}" if path else name: item for name, item in members.items()}
+        for name, item in below.items():
+            yield from leaves_of(item, name, depth + 1)
 
 
-_Path = tuple[str | int, ...]
-_STAMPS: tuple[tuple[_Path, _Path], ...] = tuple(
-    ((*above, "stamp", "sec"), (*above, "stamp", "nanosec")) for above in (("header",), ())
-)
-
-
-def parse_path(name: str) -> _Path:
-    """Return the names and numbers that lead to a field."""
-    steps = re.findall(r"\[(\d+)\]|\.?([^.\[]+)", name)
-    return tuple(int(number) if number else name for number, name in steps)
-
-
-def value_at(message: Any, path: _Path) -> Any:
-    """Return the number or text of a field, None where there is none."""
-    for step in path:
-        if isinstance(step, str):
-            message = (
-                message.get(step) if isinstance(message, dict) else getattr(message, step, None)
-            )
-        elif isinstance(message, list | tuple | array) and step < min(len(message), _MAX_ITEMS):
-            message = message[step]
-        else:
-            return None
-    return message if isinstance(message, bool | int | float | str) else None
-
-
-def stamp_s(message: Any, published_ns: int) -> float:
+def stamp_s(fields: dict[str, float | str], published_ns: int) -> float:
     """Return the time of a message in s: its header's stamp, else the time of publication."""
-    for paths in _STAMPS:
-        seconds, nanoseconds = (value_at(message, path) for path in paths)
-        if isinstance(seconds, int) and isinstance(nanoseconds, int) and (seconds or nanoseconds):
-            return float(seconds) + float(nanoseconds) * 1e-9
+    for stamp in ("header.stamp", "stamp"):
+        seconds, nanoseconds = fields.get(f"{stamp}.sec"), fields.get(f"{stamp}.nanosec")
+        if isinstance(seconds, float) and isinstance(nanoseconds, float) and seconds + nanoseconds:
+            return seconds + nanoseconds * 1e-9
     return published_ns * 1e-9
 
 
@@ -112,7 +84,7 @@ class McapSource(Source):
 
     def __init__(self, budget: Budget) -> None:
         """Take the file."""
-        self._file = budget.file
+        self._budget = budget
 
     def channels(self) -> list[Channel]:
         """Return the numbers and texts in the first message of each topic."""
@@ -126,50 +98,50 @@ class McapSource(Source):
         """Return a topic, and the path of a field. Raises `InputError`."""
         topics = [topic for topic in self._topics if column.startswith(f"{topic}.")]
         if not topics:
-            raise missing_column(self._file, column, [channel.name for channel in self.channels()])
+            raise self._missing(column)
         topic = max(topics, key=len)
         return topic, column[len(topic) + 1 :]
+
+    def _missing(self, column: str) -> Exception:
+        return missing_column(self._budget.file, column, [c.name for c in self.channels()])
 
     def read(self, topic: str, fields: dict[str, str]) -> Iterator[pl.DataFrame]:
         """Yield fields of a topic, texts or numbers. Raises `InputError` for a field without any.
 
         A field whose first messages have no value is one of numbers.
         """
-        rows = self._rows(topic, [parse_path(name) for name in fields.values()])
+        rows = self._rows(topic, [*fields.values()])
         texts: dict[str, bool] = {}
         absent = set(fields)
         while piece := list(islice(rows, PIECE_ROWS)):
-            times_s, *values_of_fields = zip(*piece, strict=True)
-            columns = [pl.Series(OWN_TIME, times_s, dtype=pl.Float64)]
-            for column, values in zip(fields, values_of_fields, strict=True):
+            frame = pl.DataFrame({OWN_TIME: [row[0] for row in piece]})
+            for place, column in enumerate(fields, 1):
+                values = [row[place] for row in piece]
                 types = {isinstance(value, str) for value in values if value is not None}
                 is_text = texts.setdefault(column, types == {True})
                 if types - {is_text}:
-                    raise InputError(
-                        f"{quote_name(self._file)}: {column!r} has texts in some messages and "
-                        "numbers in others. Map another field."
+                    raise self._budget.error(
+                        f"{column!r} has texts in some messages and numbers in others. Map another "
+                        "field."
                     )
                 absent -= {column} if types else set()
                 kind = pl.String if is_text else pl.Float64
-                columns.append(pl.Series(column, values, dtype=kind, strict=False))
-            yield pl.DataFrame(columns)
+                frame = frame.with_columns(pl.Series(column, values, dtype=kind))
+            yield frame
         for column in absent:
-            names = [f"{topic}.{name}" for name in self._topics[topic]]
-            raise missing_column(self._file, column, names)
+            raise self._missing(column)
 
-    def _rows(self, topic: str, paths: Sequence[_Path]) -> Iterator[list[Any]]:
+    def _rows(self, topic: str, fields: Sequence[str]) -> Iterator[list[Any]]:
         """Yield the time in s and the values of fields of each message of a topic."""
         for channel, decode, message in self._messages():
-            if channel.topic != topic:
-                continue
-            if decode is None:
-                raise InputError(
-                    f"{quote_name(self._file)}: topic {topic!r} has messages in an encoding that "
-                    f"is not supported ({channel.message_encoding!r}). Map another topic."
-                )
-            content = decode(message.data)
-            values = (value_at(content, path) for path in paths)
-            yield [stamp_s(content, message.publish_time), *values]
+            if channel.topic == topic:
+                if decode is None:
+                    raise self._budget.error(
+                        f"topic {topic!r} has messages in an encoding that is not supported "
+                        f"({channel.message_encoding!r}). Map another topic."
+                    )
+                leaves = dict(leaves_of(decode(message.data)))
+                yield [stamp_s(leaves, message.publish_time), *map(leaves.get, fields)]
 
     @cached_property
     def _topics(self) -> dict[str, list[str]]:
@@ -181,19 +153,18 @@ class McapSource(Source):
             if decode is not None and channel.topic not in fields_by_topic:
                 fields_by_topic[channel.topic] = list(dict(leaves_of(decode(message.data))))
         if not fields_by_topic:
-            raise InputError(
-                f"{quote_name(self._file)}: no message in it can be decoded "
-                f"({', '.join(sorted(encodings)) or 'none'}). Supported are ROS 2 messages "
-                "(cdr with ros2msg schemas) and json."
+            raise self._budget.error(
+                f"no message in it can be decoded ({', '.join(sorted(encodings)) or 'none'}). "
+                "Supported are ROS 2 messages (cdr with ros2msg schemas) and json."
             )
         return fields_by_topic
 
     def _messages(self) -> Iterator[tuple[Any, Decode | None, Any]]:
         """Yield the channel, the decoder and the record of all messages, in the file's order."""
-        mcap = load_library(self._file, "mcap.stream_reader")
+        mcap = load_library(self._budget.file, "mcap.stream_reader")
         schemas: dict[int, Any] = {}
         channels: dict[int, tuple[Any, Decode | None]] = {}
-        with self._file.open("rb") as file:
+        with self._budget.file.open("rb") as file:
             reader = mcap.StreamReader(file, validate_crcs=True, record_size_limit=None)
             for record in reader.records:
                 kind = type(record).__name__

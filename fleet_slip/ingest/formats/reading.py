@@ -58,24 +58,20 @@ class StrayLink(PosixPath):
 def require_unchanged_log(log: Path) -> Iterator[None]:
     """Raise `InputError` if a log is no regular file of its folder, or changes while it is read."""
     if isinstance(log, StrayLink):
-        raise InputError(
-            f"{quote_name(log)}: a symbolic link out of its folder, not followed. Give the file by "
-            "its own path."
-        )
-    if not log.is_file():
-        problem = "is not a regular file" if log.exists() else "no such file"
-        raise InputError(f"{quote_name(log)}: {problem}. Give the path of a file.")
-    before = _size_and_time(log)
-    yield
-    if _size_and_time(log) != before:
-        raise InputError(
-            f"{quote_name(log)}: it changed while it was read. Wait until it is complete."
-        )
-
-
-def _size_and_time(file: Path) -> tuple[int, int]:
-    with file_errors(file):
-        return file.stat().st_size, file.stat().st_mtime_ns
+        problem = "a symbolic link out of its folder, not followed. Give the file by its own path."
+    elif not log.exists():
+        problem = "no such file. Give the path of a file."
+    elif not log.is_file():
+        problem = "is not a regular file. Give the path of a file."
+    else:
+        before = log.stat()
+        yield
+        with file_errors(log):
+            after = log.stat()
+        if (after.st_size, after.st_mtime_ns) == (before.st_size, before.st_mtime_ns):
+            return
+        problem = "it changed while it was read. Wait until it is complete."
+    raise InputError(f"{quote_name(log)}: {problem}")
 
 
 def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Source]:
@@ -89,28 +85,25 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
         start = stream.read(_HDF5_AT + len(HDF5))
     for magic, program in _ARCHIVES.items():
         if start.startswith(magic):
-            raise InputError(f"{quote_name(file)}: it is an archive. Unpack it with {program}.")
+            raise budget.error(f"it is an archive. Unpack it with {program}.")
+    if start.startswith(MAGIC):
+        return open_parquet(budget)
     suffix = file.suffix.lower()
-    begun = start[_HDF5_AT:] if start.endswith(HDF5) else start
-    name = next(
-        (name for name, file_format in FORMATS.items() if begun.startswith(file_format.begins)), ""
-    )
+    start = start[_HDF5_AT:] if start.endswith(HDF5) else start
+    name = next((name for name, kind in FORMATS.items() if start.startswith(kind.begins)), "")
     if formats.can is not None:
         name = "mdf_bus" if name == "mdf" else name or "can_trace"
     elif suffix in {".blf", ".asc"}:
         name = name or "can_trace"
-    if start.startswith(MAGIC):
-        return open_parquet(budget)
     if name:
         return open_confined(name, budget, formats)
-    for file_format in (_PARQUET, *FORMATS.values()):
-        if suffix in file_format.suffixes:
-            raise InputError(
-                f"{quote_name(file)}: not {file_format.name}, despite its suffix. Export it again, "
-                "or correct the suffix."
+    for kind in (_PARQUET, *FORMATS.values()):
+        if suffix in kind.suffixes:
+            raise budget.error(
+                f"not {kind.name}, despite its suffix. Export it again, or correct the suffix."
             )
     if VBO_BEGINS.match(start) and formats.csv == CsvFormat():
-        return nullcontext(VboSource(budget, formats.plain_numbers))
+        return nullcontext(VboSource(budget))
     return nullcontext(CsvSource(budget, formats.csv, formats.plain_numbers))
 
 
@@ -207,7 +200,8 @@ class ConfinedSource(Source):
         """Take the reader's socket, the file's limits, the reader's folder and its handle."""
         self._channel, self._budget = channel, budget
         self._folder, self._handle = folder, handle
-        self.has_clock = bool(self._receive()[0])
+        channel.settimeout(_POLL_S)
+        self.has_clock = bool(self._ask("open")[0])
 
     def channels(self) -> list[Channel]:
         """Return all that can be read, in the file's order."""
@@ -239,52 +233,42 @@ class ConfinedSource(Source):
         """Send a question; return the reader's answer and rows. Raises `InputError`."""
         with suppress(OSError):  # then nothing comes back
             self._channel.sendall(json.dumps(question).encode() + b"\n")
-        return self._receive()
-
-    def _receive(self) -> tuple[Any, bytearray]:
-        """Receive an answer and rows. Raises `InputError`."""
         until_s = time.monotonic() + self._budget.seconds
         self._require_disk()
-        text, size = SIZES.unpack(self._take(SIZES.size, until_s))
-        if text > _MAX_TEXT_BYTES or size > self._budget.memory:
+        text_size, rows_size = SIZES.unpack(self._receive(SIZES.size, until_s))
+        if text_size > _MAX_TEXT_BYTES or rows_size > self._budget.memory:
             raise self._budget.crashed()
-        try:
-            answer = json.loads(self._take(text, until_s))
-        except (ValueError, RecursionError):
-            raise self._budget.crashed() from None
-        return self._require_answer(answer), self._take(size, until_s)
-
-    def _require_answer(self, answer: Any) -> Any:
+        answer: Any = None
+        with suppress(ValueError, RecursionError):
+            answer = json.loads(self._receive(text_size, until_s))
         if not isinstance(answer, dict) or not {"found", "error"} & answer.keys():
             raise self._budget.crashed()
         if "found" in answer:
-            return answer["found"]
+            return answer["found"], self._receive(rows_size, until_s)
         if answer["error"] == "MemoryError":
-            raise self._budget.over_memory()
+            raise self._budget.crashed()
         kind = getattr(errors, str(answer["error"]), InputError)
         is_ours = isinstance(kind, type) and issubclass(kind, FleetSlipError)
         raise (kind if is_ours else InputError)(str(answer.get("text")))
 
-    def _take(self, size: int, until_s: float) -> bytearray:
+    def _receive(self, size: int, until_s: float) -> bytearray:
         """Receive so many bytes. Raises `InputError` if they do not come in time."""
-        taken = bytearray(size)
-        remaining = memoryview(taken)
+        received = bytearray(size)
+        remaining = memoryview(received)
         while remaining:
-            remaining_s = until_s - time.monotonic()
-            self._channel.settimeout(min(max(remaining_s, 1e-3), _POLL_S))
+            if time.monotonic() > until_s:
+                raise self._budget.over_time()
             try:
-                received = self._channel.recv_into(remaining)
+                count = self._channel.recv_into(remaining)
             except TimeoutError:
-                if remaining_s < _POLL_S:
-                    raise self._budget.over_time() from None
                 self._require_disk()
                 continue
             except OSError:
-                received = 0
-            if not received:
+                count = 0
+            if not count:
                 raise self._budget.crashed()
-            remaining = remaining[received:]
-        return taken
+            remaining = remaining[count:]
+        return received
 
     def _require_disk(self) -> None:
         """Raise `InputError` if the reader's temporary files are larger together than one may be.
@@ -292,7 +276,7 @@ class ConfinedSource(Source):
         A file that it has deleted and holds open counts too.
         """
         if _written_bytes(self._folder, self._handle) > self._budget.unfolded:
-            raise self._budget.over_memory()
+            raise self._budget.crashed()
 
 
 def _written_bytes(folder: Path, handle: int) -> int:

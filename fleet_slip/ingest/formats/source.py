@@ -275,14 +275,10 @@ class Budget:
             raise self.exceeded(f"it decompresses to more than {self.unfolded:,} bytes")
 
     def crashed(self) -> InputError:
-        """Return the error of a file whose reader ended without a word, or talks nonsense."""
-        return self.exceeded(f"its reader crashed, or took more than {self.memory:,} bytes")
-
-    def over_memory(self) -> InputError:
-        """Return the error of a file whose reader asked for more memory, or longer files."""
+        """Return the error of a file whose reader ended, sends nonsense, or needs too much."""
         return self.exceeded(
-            f"its reader needs more than {self.memory:,} bytes, or {self.unfolded:,} in a "
-            "temporary file"
+            f"its reader crashed, or needs more than {self.memory:,} bytes, or {self.unfolded:,} "
+            "in a temporary file"
         )
 
     def over_time(self) -> InputError:
@@ -291,10 +287,14 @@ class Budget:
 
     def exceeded(self, problem: str) -> InputError:
         """Return the error of a file that is too much for its size."""
-        return InputError(
-            f"{quote_name(self.file)}: {problem}, the limit for its {self.size:,} bytes. Is it "
-            "damaged? If it is a real recording, export it as uncompressed CSV."
+        return self.error(
+            f"{problem}, the limit for its {self.size:,} bytes. Is it damaged? If it is a real "
+            "recording, export it as uncompressed CSV."
         )
+
+    def error(self, text: str) -> InputError:
+        """Return an error that names the file."""
+        return InputError(f"{quote_name(self.file)}: {text}")
 
     def metered(self, batches: Iterator[pl.DataFrame]) -> Iterator[pl.DataFrame]:
         """Yield batches while rows and seconds last; the caller's own time does not count."""
