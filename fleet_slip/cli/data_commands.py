@@ -207,7 +207,10 @@ def suggest(
     if output is not None and output.exists():
         raise UsageError(f"{output} exists. Choose another name, or remove it.")
     catalog = fleet_of(context).warehouse.catalog.signals
-    draft, text = _draft(catalog, file, can)
+    from fleet_slip.ingest.draft import name_of, write_draft
+
+    draft, name = _draft(catalog, file, can), name_of(Path(file).stem)
+    text = write_draft(draft, name)
     signals = {guess.profile.channel.name: name for name, guess in draft.guesses.items()}
     channels = [
         {
@@ -234,7 +237,8 @@ def suggest(
 
         write_text(plot, write_signal_page(catalog, draft), ": the mapped signals")
     if output is not None:
-        write_text(output, _ask_for_open(draft, text), ": a draft of a mapping")
+        text = write_draft(draft, name, _ask_for_open(draft))
+        write_text(output, text, ": a draft of a mapping")
     elif not json:
         print_text("\n" + text)
 
@@ -250,15 +254,13 @@ def list_mappings(context: Context, json: opt.Json = False) -> None:
     print_table(files, json, TextTable("", "mapping|file", files.items(), text_columns=2))
 
 
-def _ask_for_open(draft: "Draft", text: str) -> str:
-    """Ask for the open keys of a draft on a terminal; return the draft with the answers."""
+def _ask_for_open(draft: "Draft") -> dict[str, str]:
+    """Ask for the open keys of a draft on a terminal; return the answers."""
+    answers: dict[str, str] = {}
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        return text
-
-    from fleet_slip.ingest.draft import answer_key, open_keys
-
+        return answers
     say("Some keys of the draft are open. An empty answer leaves a key open.")
-    for key, units in open_keys(draft, text).items():
+    for key, units in draft.open_keys().items():
         choices = f" in {' or '.join(units)}" if units else ""
         try:
             answer = typer.prompt(f"{key}{choices}", default="", show_default=False, err=True)
@@ -267,13 +269,13 @@ def _ask_for_open(draft: "Draft", text: str) -> str:
                 raise KeyboardInterrupt from None
             say("")
             break  # the input has ended
-        text = answer_key(text, key, answer.strip())
-    return text
+        answers[key] = answer.strip()
+    return answers
 
 
-def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draft, str]":
-    """Return the draft of a mapping for a log, and its text."""
-    from fleet_slip.ingest.draft import draft_mapping, name_of, write_draft
+def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "Draft":
+    """Return the draft of a mapping for a log."""
+    from fleet_slip.ingest.draft import draft_mapping
     from fleet_slip.ingest.formats.file_formats import CanBus, read_can_database
     from fleet_slip.ingest.log_files import FileGroup, find_logs
     from fleet_slip.ingest.profile import profile_file
@@ -285,8 +287,7 @@ def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draf
         raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
     # The first session of a lake that has all messages.
     log = max(groups, key=lambda group: len(group.members)) if groups else logs[0]
-    draft = draft_mapping(signals, log, profile_file(log, bus))
-    return draft, write_draft(draft, name_of(Path(file).stem))
+    return draft_mapping(signals, log, profile_file(log, bus))
 
 
 # Gram rows.

@@ -19,7 +19,6 @@ from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.ingest.columns import (
     CHOOSE,
     VELOCITY,
-    Component,
     conversion_factor,
     measures,
     reads_clock,
@@ -78,9 +77,41 @@ class Guess:
         return self.profile.channel.name
 
     @property
-    def component(self) -> Component | None:
-        """Component of the velocity over ground."""
-        return self.keys.get("component")
+    def entry(self) -> dict[str, Any]:
+        """The signal in a mapping, with the keys that are not usual."""
+        column = {} if "north" in self.keys else {"column": self.column}
+        rate_hz, entry = self.profile.rate_hz, {**column, **self.keys}
+        if rate_hz and rate_hz < 20 and self.signal not in {COURSE, SATELLITE_SPEED}:
+            entry["longest_gap_s"] = round(2 / rate_hz, 2)
+        return entry
+
+    @property
+    def is_doubtful(self) -> bool:
+        """True if something speaks against it, or for others too."""
+        return bool(self.doubts or self.rivals)
+
+    @property
+    def explanation(self) -> str:
+        """The reasons or doubts."""
+        if self.is_doubtful:
+            doubts = "; ".join(self.doubts) or "its name and unit fit several columns"
+            return f"Doubtful: {self.signal}: {doubts}"
+        return f"{self.signal}: {'; '.join(self.reasons)}"
+
+    @property
+    def choices(self) -> str:
+        """The units that are possible, as a person writes them."""
+        units = [f'"{keys["unit"]}"' for keys in self.readings]
+        if "radius_m" in self.readings[0]:  # as every velocity of a wheel
+            units[0] += f" with radius_m = {RADIUS_M}"
+        return " or ".join(units)
+
+    def answered(self, unit: str | None) -> "Guess":
+        """Return the guess with a unit that a person chose."""
+        if not unit:
+            return self
+        keys = next((keys for keys in self.readings if keys["unit"] == unit), {"unit": unit})
+        return replace(self, keys={**self.keys, **keys}, readings=())
 
     def because(self, reason: str, **keys: Any) -> "Guess":
         """Return the guess with more keys, and one more reason."""
@@ -137,8 +168,8 @@ def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
     north, east = result.pop("north", None), result.pop("east", None)
     course, speed = result.get(COURSE), result.get(SATELLITE_SPEED)
     if north and east and north.keys == east.keys:
-        result[COURSE] = replace(north, signal=COURSE, keys={**north.keys, "component": "north"})
-        keys = {**east.keys, "component": "east"}
+        keys = {"north": north.column, "east": east.column, **north.keys}
+        result[COURSE] = replace(north, signal=COURSE, keys=keys)
         result[SATELLITE_SPEED] = replace(east, signal=SATELLITE_SPEED, keys=keys)
     elif course and speed:
         reason = "clockwise from north, as receivers give it"
@@ -146,7 +177,7 @@ def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
     if "yaw_rate" not in result or not {COURSE, SATELLITE_SPEED} <= set(result):
         result.pop(COURSE, None)
         alone = result.pop(SATELLITE_SPEED, None)
-        if alone and not alone.component:
+        if alone and "north" not in alone.keys:
             result.setdefault("vehicle_speed", replace(alone, signal="vehicle_speed"))
     return result
 

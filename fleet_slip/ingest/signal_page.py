@@ -7,7 +7,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.base import quote_name
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.ingest.columns import SignalColumn
-from fleet_slip.ingest.draft import Draft, signal_keys
+from fleet_slip.ingest.draft import Draft
 from fleet_slip.ingest.guess import Guess
 from fleet_slip.pages.page import WIDTH_IN, Picture, colour, draw, fill_in
 
@@ -18,10 +18,10 @@ _PANEL_IN = 1.1
 
 def write_signal_page(catalog: SignalCatalog, draft: Draft) -> str:
     """Return a page with the signals of a draft: in SI units, or as logged without a unit."""
-    guesses = {**draft.guesses, **draft.questions}
+    guesses = draft.guesses
     titles = []
     for name, guess in guesses.items():
-        state = " (doubtful)" if name in draft.questions else ""
+        state = " (doubtful)" if guess.is_doubtful else ""
         unit = "no unit in the file" if guess.readings else catalog[name].unit
         titles.append(f"{name}{state} of {guess.column}, {unit}")
     picture = Picture(
@@ -52,9 +52,9 @@ def _panels(
 def in_si(catalog: SignalCatalog, name: str, guess: Guess) -> FloatArray:
     """Return the values of a guess in the catalog's unit; as logged if the unit is open."""
     values = guess.profile.values
-    if guess.readings or guess.component:
+    if guess.readings or "north" in guess.keys:
         return values
-    column = SignalColumn.model_validate(signal_keys(guess))
+    column = SignalColumn.model_validate(guess.entry)
     gain, bias = column.linear(catalog[name].unit)
     return np.asarray(gain * values + bias, dtype=np.float64)
 

@@ -14,7 +14,7 @@ import pytest
 
 from fleet_slip.errors import AlarmError, ConfigError, InputError, UsageError
 from fleet_slip.ingest.checked_columns import IngestCounts
-from fleet_slip.ingest.draft import answer_key, draft_mapping, open_keys, write_draft
+from fleet_slip.ingest.draft import draft_mapping, write_draft
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.measured_log import open_measured
 from fleet_slip.ingest.profile import profile_file
@@ -382,11 +382,10 @@ def test_answers_fill_in_what_a_draft_leaves_open(tmp_path: Path) -> None:
     file = tmp_path / "log.csv"
     pl.DataFrame(table).write_csv(file)
     draft = draft_mapping(SIGNALS, file, profile_file(file))
-    text = write_draft(draft, "log")
     answers = {"day": "2024-06-03", "vehicle_id": "A7", "vehicle_model": 's"1', "ay": "g"}
-    assert {"day", "vehicle_id", "vehicle_model", "ay", "wheel_fl"} <= open_keys(draft, text).keys()
-    for key in open_keys(draft, text):
-        text = answer_key(text, key, answers.get(key, "km/h"))
+    assert {*answers, "wheel_fl"} <= draft.open_keys().keys()
+    answers = {key: answers.get(key, "km/h") for key in draft.open_keys()}
+    text = write_draft(draft, "log", answers)
     content = tomllib.loads(text)
     assert content["drive"]["vehicle_model"] == 's"1'
     assert content["signals"]["ay"]["unit"] == "g"
@@ -394,7 +393,8 @@ def test_answers_fill_in_what_a_draft_leaves_open(tmp_path: Path) -> None:
         assert content["signals"][wheel]["radius_m"] == RADIUS_M
     (tmp_path / "log.toml").write_text(text)
     assert load_mapping(str(tmp_path / "log.toml"), CATALOG).drive.vehicle_id == "A7"
-    assert answer_key(text, "ay", "") == text
+    unanswered = write_draft(draft, "log", dict.fromkeys(answers, ""))
+    assert unanswered == write_draft(draft, "log")
 
 
 def test_a_mapping_names_all_missing_keys_at_once(tmp_path: Path) -> None:
