@@ -36,7 +36,6 @@ from fleet_slip.simulation.scenario import Failure, Scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
 from fleet_slip.simulation.simulate import (
     MOTION,
-    DriveLog,
     SimulationReport,
     simulate_batches,
     simulate_logs,
@@ -344,25 +343,21 @@ def simulate_drives(signals: SignalCatalog, scenarios: Sequence[Scenario]) -> tu
     """
     drives = {scenario.drive_id: scenario.batch().drives[0] for scenario in scenarios}
     logs = dict(zip(drives, simulate_logs(signals, list(drives.values()), MOTION), strict=True))
-    return tuple(_test_drive(signals, scenario, logs[scenario.drive_id]) for scenario in scenarios)
-
-
-def _test_drive(signals: SignalCatalog, scenario: Scenario, log: DriveLog) -> TestDrive:
-    time_s = np.arange(log.rows) / SAMPLE_RATE_HZ
-    visible = {}
-    for name in (*signals.inputs, *GPS_SIGNALS):  # never a truth
-        values = log.measurement.counts[name] * float(signals[name].scale)
-        missing = name in GPS_SIGNALS and ~log.measurement.gps_fix
-        visible[name] = np.where(missing, np.nan, values)
-    for failure in scenario.failures:
-        visible = apply_failure(visible, time_s, failure)
-    return TestDrive(
-        scenario=scenario,
-        time_s=time_s,
-        columns={signals[name].column: values for name, values in visible.items()},
-        **log.motion,
-        lost_control_s=log.lost_control_s,
-    )
+    tests = []
+    for scenario in scenarios:
+        log = logs[scenario.drive_id]
+        time_s = np.arange(log.rows) / SAMPLE_RATE_HZ
+        visible = {}
+        for name in (*signals.inputs, *GPS_SIGNALS):  # never a truth
+            values = log.measurement.counts[name] * float(signals[name].scale)
+            missing = name in GPS_SIGNALS and ~log.measurement.gps_fix
+            visible[name] = np.where(missing, np.nan, values)
+        for failure in scenario.failures:
+            visible = apply_failure(visible, time_s, failure)
+        columns = {signals[name].column: values for name, values in visible.items()}
+        lost_s = log.lost_control_s
+        tests.append(TestDrive(scenario, time_s, columns, **log.motion, lost_control_s=lost_s))
+    return tuple(tests)
 
 
 def apply_failure(
