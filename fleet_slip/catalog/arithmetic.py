@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 from fleet_slip.errors import QuestionError
 
@@ -52,14 +53,12 @@ COMPUTED: Mapping[str, Callable[..., int | None]] = {
 """Python function of each step."""
 
 
-@dataclass(frozen=True)
-class Step:
-    """One operation on earlier steps; without operands a signal `name` or a constant `value`."""
+class Step(NamedTuple):
+    """The name of an operation, the numbers of the steps that are its operands, plain numbers."""
 
-    function: str
+    name: str
     operands: tuple[int, ...] = ()
-    value: int = 0
-    name: str = ""
+    plain: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,8 @@ class Arithmetic:
     Attributes
     ----------
     steps
-        Operations in order, without repetitions; the last is the result.
+        Operations in order, without repetitions; the last is the result. A `signal` has its place
+        among the inputs, and a `constant` its value.
     guard, at_least
         The row has a value if step `guard` is at least `at_least`.
     inputs
@@ -102,21 +102,22 @@ def parse(sql: str) -> Arithmetic:
         builder.add(trees[-1], last=True)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise QuestionError(f"{sql[:200]!r} is not integer arithmetic on counts.") from None
-    names = tuple(dict.fromkeys(step.name for step in builder.steps if step.name))
     at_least = int(guarded[2]) if guarded else 0
     if max(builder.bounds) + at_least >= _OVERFLOW:
         raise QuestionError(f"{sql[:200]!r} can need more than 64 bits: divide earlier.")
-    return Arithmetic(tuple(builder.steps), guard, at_least, names)
+    return Arithmetic(tuple(builder.steps), guard, at_least, tuple(builder.inputs))
 
 
 def evaluate(sql: str, counts: Mapping[str, int]) -> int | None:
     """Evaluate the SQL of a feature in one row; return None if it has no value."""
     arithmetic, results = parse(sql), list[int]()
     for step in arithmetic.steps:
-        if step.function:
-            value = COMPUTED[step.function](*(results[operand] for operand in step.operands))
+        value: int | None
+        if step.operands:
+            value = COMPUTED[step.name](*(results[operand] for operand in step.operands))
         else:
-            value = counts[step.name] if step.name else step.value
+            number = step.plain[0]
+            value = counts[arithmetic.inputs[number]] if step.name == "signal" else number
         if value is None:
             return None
         results.append(value)
@@ -130,14 +131,16 @@ class _Builder:
     def __init__(self) -> None:
         self.steps: list[Step] = []
         self.bounds: list[int] = []
+        self.inputs: dict[str, int] = {}
 
     def add(self, tree: ast.expr, *, last: bool = False) -> int:
         """Add the steps of a tree; return the number of its result."""
         match tree:
             case ast.Name(id=name):
-                step, bound = Step("", name=name), LARGEST_INPUT
+                place = self.inputs.setdefault(name, len(self.inputs))
+                step, bound = Step("signal", plain=(place,)), LARGEST_INPUT
             case ast.Constant(value=int(value)) if not isinstance(value, bool):
-                step, bound = Step("", value=value), abs(value)
+                step, bound = Step("constant", plain=(value,)), abs(value)
             case ast.UnaryOp(op=ast.UAdd(), operand=operand):
                 return self.add(operand, last=last)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
@@ -157,11 +160,12 @@ class _Builder:
     def _call(self, function: str, *parts: ast.expr) -> tuple[Step, int]:
         operands = tuple(map(self.add, parts))
         sizes = [self.bounds[operand] for operand in operands]
+        last = self.steps[operands[-1]]
         bound = {
             "+": sum(sizes),
             "-": sum(sizes),
             "*": sizes[0] * sizes[-1],
             "sign": 1,
-            "//": sizes[0] // max(1, self.steps[operands[-1]].value),
+            "//": sizes[0] // (max(1, *last.plain) if last.name == "constant" else 1),
         }.get(function, sizes[0])
         return Step(function, operands), bound

@@ -7,7 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from fleet_slip.catalog.arithmetic import nearest_sql
+from fleet_slip.catalog.arithmetic import Step, nearest_sql
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import MAX_ATTRIBUTE, Definition, rows_behind
 from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
@@ -16,7 +16,6 @@ from fleet_slip.columns.lowering import (
     POWERS,
     Lowering,
     Range,
-    Step,
     VehicleAttribute,
     size_of,
 )

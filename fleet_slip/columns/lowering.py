@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import reduce
 from itertools import combinations_with_replacement
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
-from fleet_slip.catalog.arithmetic import nearest, parse, truncated
+from fleet_slip.catalog.arithmetic import Step, nearest, parse, truncated
 from fleet_slip.catalog.definitions import (
     CALIBRATION_PARAMETERS,
     COUNT_BITS,
@@ -35,15 +35,6 @@ from fleet_slip.columns.observer import ObserverLowering, lower_blend
 from fleet_slip.errors import QuestionError
 
 Range = tuple[int, int]
-
-
-class Step(NamedTuple):
-    """The name of an operation, the numbers of the steps that are its operands, plain numbers."""
-
-    name: str
-    operands: tuple[int, ...] = ()
-    plain: tuple[int, ...] = ()
-
 
 Missing = Literal["never", "given", "operands", "divisor", "less", "both"]
 """When a step is missing: never; with its input or past value; with an operand; also for a divisor
@@ -331,12 +322,10 @@ class Lowering:
         arithmetic = parse(column.sql)
         results: list[int] = []
         for step in arithmetic.steps:
-            if step.name:
-                results.append(self.do("signal", self.signals[step.name]))
-            elif not step.function:
-                results.append(self.constant(step.value))
-            else:
-                results.append(self.do(step.function, *(results[i] for i in step.operands)))
+            plain = step.plain
+            if step.name == "signal":
+                plain = (self.signals[arithmetic.inputs[plain[0]]],)
+            results.append(self.do(step.name, *(results[i] for i in step.operands), *plain))
         limit = limit_of(column.of_bits)
         if arithmetic.guard is None:
             return self.clip(results[-1], limit)

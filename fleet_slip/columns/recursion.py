@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.columns.lowering import Step
+from fleet_slip.catalog.arithmetic import Step
 from fleet_slip.compiling import kernel
 
 NAMES = (

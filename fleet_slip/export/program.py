@@ -13,7 +13,7 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Literal
 
-from fleet_slip.catalog.arithmetic import parse
+from fleet_slip.catalog.arithmetic import Step, parse
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import plain_column
 from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
@@ -21,7 +21,6 @@ from fleet_slip.columns.lowering import (
     Lowering,
     ParameterCount,
     Range,
-    Step,
     VehicleAttribute,
     given_ranges,
     ranges_of,
