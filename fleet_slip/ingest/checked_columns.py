@@ -21,7 +21,6 @@ from fleet_slip.ingest.batches import DISORDER, HELD, LATER, ROW, read_batches, 
 from fleet_slip.ingest.columns import (
     as_number,
     count_range,
-    describe,
     unfit_column,
     without_missing,
 )
@@ -308,9 +307,10 @@ def check_rows(
     if not counts.rows_read:
         raise InputError(f"{quote_name(file)}: a header without rows. Export it again.")
     if counts.rows_left_out == counts.rows_read:
+        where = [condition.model_dump(exclude_defaults=True) for condition in mapping.where]
         raise InputError(
             f"{quote_name(file)}: none of {counts.rows_read:,} rows meets the condition of mapping "
-            f"{mapping.name!r}: {describe(mapping.where)}."
+            f"{mapping.name!r}: where = {where}."
         )
 
 

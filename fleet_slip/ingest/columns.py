@@ -528,13 +528,3 @@ class RowCondition(Config):
             return value.is_in(self.one_of).fill_null(value=False)
         met = (_BOUNDS[key](value, bound) for key, bound in self.bounds.items())
         return reduce(operator.and_, met, value.is_finite()).fill_null(value=False)
-
-
-def describe(conditions: Sequence[RowCondition]) -> str:
-    """Return conditions as a message shows them."""
-    texts = []
-    for condition in conditions:
-        bounds = {"one_of": condition.one_of} if condition.one_of else condition.bounds
-        limits = " and ".join(f"{key.replace('_', ' ')} {value}" for key, value in bounds.items())
-        texts.append(f"{condition.column!r} is {limits}")
-    return " and ".join(texts)

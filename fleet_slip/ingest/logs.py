@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TypeAlias
+from typing import NamedTuple, Self, TypeAlias
 
 import numpy as np
 import polars as pl
@@ -561,20 +561,14 @@ class DataFiles:
         self._written.append((digest, self._threads.submit(self._write, name, rows)))
 
     def _write(self, name: str, rows: list[pa.Table]) -> list[AddAction]:
-        by_day = _by_day(pa.concat_tables(rows).unify_dictionaries())
-        encoded = {day: self._table.encode(of_day) for day, of_day in by_day.items()}
-        del by_day  # frees memory during slow writes
+        table = pa.concat_tables(rows).unify_dictionaries()
+        days = table["day"].unique() if "day" in table.column_names else pa.array([None])
+        encoded = {}
+        for day in days:  # rejected rows have none
+            of_day = table if len(days) == 1 else table.filter(pc.equal(table["day"], day))
+            encoded[day.as_py()] = self._table.encode(of_day)
+        del table, of_day  # frees memory during slow writes
         return [self._table.put(name, content, day) for day, content in encoded.items()]
-
-
-def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
-    """Return rows by day; rejected rows, which have no day, under None."""
-    if "day" not in rows.column_names:
-        return {None: rows}
-    days = rows["day"].unique().to_pylist()
-    if len(days) == 1:
-        return {days[0]: rows}
-    return {day: rows.filter(pc.equal(rows["day"], pa.scalar(day, pa.date32()))) for day in days}
 
 
 def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:

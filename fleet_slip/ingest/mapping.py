@@ -105,6 +105,15 @@ class FromColumn(Config):
     column: Name
 
 
+def _has_one_place(path: str) -> str:
+    if path.count("{}") != 1:
+        raise ValueError("write {} once, in place of the value: '{}/*' is the folder's name")
+    return path
+
+
+PathPattern = Annotated[Name, AfterValidator(_has_one_place)]
+
+
 class FromPath(Config):
     """A drive's metadata in the path of its file, where the pattern has `{}`.
 
@@ -112,14 +121,7 @@ class FromPath(Config):
     `{}` nor `*` reaches beyond a `/`.
     """
 
-    path: Name
-
-    @field_validator("path")
-    @classmethod
-    def _has_one_place(cls, path: str) -> str:
-        if path.count("{}") != 1:
-            raise ValueError("write {} once, in place of the value: '{}/*' is the folder's name")
-        return path
+    path: PathPattern
 
     def find(self, file: Path) -> str:
         """Return the text of `{}` in a file's path. Raises `InputError` for another path."""
@@ -185,14 +187,13 @@ class FilePattern(Config):
 
     name: Annotated[str, Field(pattern=r"^[^/]+$", max_length=100)]
     """How its columns begin: `NAME/COLUMN`."""
-    path: Name
+    path: PathPattern
     """Pattern of the path, `{}_imu.csv`: `{}` is the name of the drive."""
     time: TimeBase | None = None
     """The column of its times, unless the file has a clock."""
 
     @model_validator(mode="after")
     def _is_pattern(self) -> "FilePattern":
-        FromPath(path=self.path)
         if self.time is not None and self.time.column is None:
             raise ValueError("time needs a 'column'")
         return self
@@ -226,15 +227,7 @@ class Mapping(Config):
     vehicle: VehicleMeasures | None = added(None)
     """Measured data of the car, for a filter beside the model: `fleet-slip learn`."""
     where: tuple[RowCondition, ...] = added((), max_length=MAX_CONDITIONS)
-    """Conditions on rows. A row that misses one is skipped and counted."""
-
-    @field_validator("where", mode="before")
-    @classmethod
-    def _is_no_text(cls, where: Any) -> Any:
-        if isinstance(where, str):
-            example = '[{ column = "fix", one_of = ["4", "5"] }]'
-            raise ValueError(f"write it as tables: {example}")  # noqa: TRY004 - as of pydantic
-        return where
+    """Conditions on rows, as tables. A row that misses one is skipped and counted."""
 
     @model_validator(mode="before")
     @classmethod

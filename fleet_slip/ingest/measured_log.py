@@ -294,33 +294,27 @@ def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
     return digest.hexdigest(), content.hexdigest()
 
 
-def _file_digest(file: Path) -> "hashlib._Hash":
-    """Return the SHA-256 of a file's bytes. Raises `InputError`."""
-    with file_errors(file), file.open("rb") as stream:
-        _require_dense(file, stream.fileno())
-        return hashlib.file_digest(stream, "sha256")
-
-
 MAX_SPARSE_BYTES, SPARSE_RATIO = 2**30, 64
 """A larger file is refused if it states so many times its space on disk."""
 
 
-def _require_dense(file: Path, descriptor: int) -> None:
-    """Raise `InputError` for a large file that is almost all holes, which take long to read.
+def _file_digest(file: Path) -> "hashlib._Hash":
+    """Return the SHA-256 of a file's bytes. Raises `InputError`.
 
-    A compressed file system gives a file less space too, but such a file has no hole.
+    Large files that are almost all holes, which take long to read, are refused. A compressed file
+    system gives a file less space too, but such a file has no hole.
     """
-    status = os.fstat(descriptor)
-    written = 512 * status.st_blocks
-    if status.st_size <= max(MAX_SPARSE_BYTES, SPARSE_RATIO * written):
-        return
-    first_hole = os.lseek(descriptor, 0, os.SEEK_HOLE)
-    os.lseek(descriptor, 0, os.SEEK_SET)
-    if first_hole < status.st_size:
-        raise InputError(
-            f"{quote_name(file)}: its size is {status.st_size:,} bytes, but only {written:,} were "
-            "ever written. Copy it again."
-        )
+    with file_errors(file), file.open("rb") as stream:
+        status = os.fstat(stream.fileno())
+        size, written = status.st_size, 512 * status.st_blocks
+        if size > max(MAX_SPARSE_BYTES, SPARSE_RATIO * written):
+            if stream.seek(0, os.SEEK_HOLE) < size:
+                raise InputError(
+                    f"{quote_name(file)}: its size is {size:,} bytes, but only {written:,} were "
+                    "ever written. Copy it again."
+                )
+            stream.seek(0)
+        return hashlib.file_digest(stream, "sha256")
 
 
 # Faults of a log as a whole: many rejected rows, and several cars, where one is under way
