@@ -228,7 +228,7 @@ def sort_by_group(blocks: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
         return
     for group in sorted(groups | _spill(rows, spool)):
         content = bytearray()
-        for piece in spool.take(group):
+        for piece in spool.read(group):
             content += piece
             if len(content) > BLOCK_BYTES:
                 yield _rows_of(content, rows.schema)

@@ -48,9 +48,6 @@ MAX_FRAME_BYTES = 64
 """Bytes of a frame of CAN FD."""
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 
-PIECE_FRAMES = 2**12
-"""Frames of one message that are in memory at once."""
-
 
 def is_possible(signal: Any) -> bool:
     """Return True if a signal fits a frame: at most 64 bits in 64 bytes, floats of their sizes."""
@@ -334,7 +331,7 @@ class CanSource(Source):
         if not self._counts.is_empty() and keys <= self._spooled:
             return
         self._spooled |= keys
-        self._spool.clear()
+        self._spool = Spool()
         counts = []
         for frames in self._read_frames():
             counts.append(frames.group_by("key", "bus", "size").len())

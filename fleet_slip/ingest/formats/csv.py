@@ -276,8 +276,8 @@ def _decode(block: bytes, budget: Budget) -> str:
         try:
             return block.decode("utf-8")
         except UnicodeDecodeError as error:
-            near = block[error.start - min(error.start, 20) : error.start + 20]
-            problem = f"not UTF-8, near {near!r}"
+            excerpt = block[error.start - min(error.start, 20) : error.start + 20]
+            problem = f"not UTF-8, near {excerpt!r}"
     raise budget.error(
         f"{problem}. Write encoding under [csv] in the mapping: 'cp1252' of Western Windows, or "
         "'utf-16'; or give a Parquet file."

@@ -347,15 +347,3 @@ class Spool:
         for start, size in self._pieces.get(key, ()):
             self._file.seek(start)
             yield self._file.read(size)
-
-    def take(self, key: Hashable) -> Iterator[bytes]:
-        """Yield the pieces of a key, and forget where they are: of thousands that takes memory."""
-        yield from self.read(key)
-        self._pieces.pop(key, None)
-
-    def clear(self) -> None:
-        """Forget all pieces."""
-        self._pieces.clear()
-        self._file.seek(0)
-        self._file.truncate()
-        self._end = 0
