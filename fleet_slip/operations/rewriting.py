@@ -5,11 +5,12 @@ bytes depend on the drives only.
 """
 
 import dataclasses
+import math
 import re
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
-from decimal import Decimal
 from types import MappingProxyType
 
 import pyarrow as pa
@@ -303,9 +304,10 @@ def find_expired(warehouse: Warehouse, retention_hours: float) -> list[StoredFil
         snapshot = table.snapshot()
         if snapshot.version is None:  # its Delta log may have been lost, and these be its data
             continue
-        expired = snapshot.removed_before(retention_hours)
-        candidates += [file for file in files if file.path in expired]
-        uncommitted += [file for file in files if file.path not in snapshot.removals]
+        newest_ms = 1e3 * time.time() - 3.6e6 * retention_hours
+        removals = snapshot.removals
+        candidates += [file for file in files if removals.get(file.path, math.inf) <= newest_ms]
+        uncommitted += [file for file in files if file.path not in removals]
     candidates += [file for file in uncommitted if file.age_hours >= BEING_WRITTEN_HOURS]
     return [file for file in candidates if file.age_hours >= retention_hours]
 
@@ -391,23 +393,26 @@ def migrate(warehouse: Warehouse) -> MigrationReport:
         evolution = None
         if delta is not None:
             evolution = table.require_readable(delta)
-            _add_columns(table, delta, evolution)
+            if evolution.added:
+                _add_columns(table, delta, evolution.added)
     if evolution is None:
         return MigrationReport((), (), None)
     version = warehouse.logs.snapshot().version
     return MigrationReport(evolution.added, evolution.retired, version)
 
 
-def _add_columns(table: Table, delta: DeltaTable, evolution: Evolution) -> None:
-    fields = {field.name: field for field in Schema.from_arrow(table.schema).fields}
+def _add_columns(table: Table, delta: DeltaTable, names: Collection[str]) -> None:
     scales = scales_of(table.schema)
-    if not evolution.added:
-        return
+    fields = [
+        Field(
+            field.name,
+            field.type,
+            nullable=True,
+            metadata={SCALE: str(scales[field.name])} if field.name in scales else {},
+        )
+        for field in Schema.from_arrow(table.schema).fields
+        if field.name in names
+    ]
     with table.committing():
         delta.alter.set_table_properties(ALL_STATISTICS)
-        delta.alter.add_columns([_with_scale(fields[n], scales) for n in evolution.added])
-
-
-def _with_scale(field: Field, scales: Mapping[str, Decimal]) -> Field:
-    metadata = {SCALE: str(scales[field.name])} if field.name in scales else {}
-    return Field(field.name, field.type, nullable=True, metadata=metadata)
+        delta.alter.add_columns(fields)

@@ -384,15 +384,12 @@ class SensorScreen:
         sentences = []
         if self.faults_by_hash:
             out = pluralize(len(self.faults_by_hash), "drive")
+            faults = ", ".join(f"{number:,} {fault}" for fault, number in self.faults.items())
             sentences.append(
-                f"{out} of {self.drives:,} left out: faulty sensors ({self._faults_text}). See: "
+                f"{out} of {self.drives:,} left out: faulty sensors ({faults}). See: "
                 "fleet-slip quality. To use them anyway: --include-faulty"
             )
         return " ".join([*sentences, self.remaining_text]).strip()
-
-    @property
-    def _faults_text(self) -> str:
-        return ", ".join(f"{number:,} {fault}" for fault, number in self.faults.items())
 
     def findings(self, warehouse: Warehouse) -> tuple[SensorFault, ...]:
         """Return the faulty drives by name, by day and drive."""

@@ -32,9 +32,6 @@ from fleet_slip.warehouse.erasure_log import find_erased
 from fleet_slip.warehouse.gram_reader import find_backlog
 from fleet_slip.warehouse.warehouse import Warehouse
 
-SECONDS_PER_HOUR = 3600
-_FULL = "disk {:.1%} free, below {:.0%}"
-
 RETURNED_SHOWN = 5
 """Maximum number of commands shown for erased cars and drives."""
 
@@ -163,7 +160,11 @@ def status_of(
         *_returned(warehouse, tuple(snapshots.values())),
         *_failed(last_runs),
         *_unsafe_store(warehouse.root),
-        *([_FULL.format(free, least)] if free is not None and free < least else []),
+        *(
+            [f"disk {free:.1%} free, below {least:.0%}"]
+            if free is not None and free < least
+            else []
+        ),
         *dict.fromkeys([*damaged, *find_lost(warehouse.root)]),
         *(f"{path}: {problem}" for path, problem in changed),
     ]
@@ -196,7 +197,7 @@ def _table(snapshot: Snapshot) -> TableStatus:
 
 
 def _age_hours(moment: datetime | None, now: datetime) -> float | None:
-    return None if moment is None else (now - moment).total_seconds() / SECONDS_PER_HOUR
+    return None if moment is None else (now - moment) / timedelta(hours=1)
 
 
 def _from_ms(milliseconds: int | None) -> datetime | None:

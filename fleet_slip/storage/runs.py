@@ -150,7 +150,9 @@ class Run:
 
     def end(self, error: BaseException | None, seconds: float) -> dict[str, Any]:
         """Return the line that is written when the run ends."""
-        exit_code = _exit_code(error)
+        exit_code = 0 if error is None else int(getattr(error, "exit_code", 1))
+        if isinstance(error, KeyboardInterrupt):
+            exit_code = INTERRUPTED
         message = _without_hidden(hide_passwords(str(error)), self.arguments)[:ERROR_MAX]
         outcome = {0: "done", INTERRUPTED: "interrupted"}.get(exit_code, "failed")
         return {
@@ -265,14 +267,6 @@ def _append(root: Folder, file: str, *records: Mapping[str, Any]) -> bool | None
     except StorageError:
         return False
     return True
-
-
-def _exit_code(error: BaseException | None) -> int:
-    if error is None:
-        return 0
-    if isinstance(error, KeyboardInterrupt):
-        return INTERRUPTED
-    return int(getattr(error, "exit_code", 1))
 
 
 def _timestamp(moment: datetime) -> str:

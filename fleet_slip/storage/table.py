@@ -166,10 +166,6 @@ def rows_in(action: AddAction) -> int:
     return int(json.loads(action.stats)["numRecords"])
 
 
-def _columns_of(added: Iterable[AddAction]) -> set[str]:
-    return {name for action in added for name in json.loads(action.stats)["nullCount"]}
-
-
 def _partition(day: date | None) -> dict[str, str | None]:
     return {"day": day.isoformat()} if day else {}
 
@@ -381,11 +377,6 @@ class Snapshot:
         with storage_errors(self.table.folder):
             return read_removals(self.table.folder, self.version)
 
-    def removed_before(self, hours: float) -> set[str]:
-        """Return the files that were removed at least `hours` ago, by this clock."""
-        newest = _now_ms() - hours * 3.6e6
-        return {path for path, removed_ms in self.removals.items() if removed_ms <= newest}
-
     def transaction_version(self, name: str) -> int | None:
         """Return the version of a committed transaction; None without one."""
         return self.transactions.get(name)
@@ -418,7 +409,8 @@ class Snapshot:
         note = checked_note(change.note, actions, {u.name: u.version for u in change.transactions})
         with table.committing():
             delta = self.delta or table.create()
-            table.require_writable(_columns_of(change.add), delta)
+            added = (json.loads(action.stats)["nullCount"] for action in change.add)
+            table.require_writable({name for columns in added for name in columns}, delta)
             delta.create_write_transaction(
                 actions,
                 mode="append",

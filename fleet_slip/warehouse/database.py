@@ -311,13 +311,13 @@ def _require_reading(database: duckdb.DuckDBPyConnection, text: str) -> None:
 
 
 def _require_function(name: str, after_from: bool) -> None:
-    allowed = allowed_words()
-    if after_from and name not in allowed["table"]["functions"]:
+    table_functions = allowed_words()["table"]["functions"]
+    if after_from and name not in table_functions:
         raise QuestionError(
             f"the function {printable(name)!r} cannot be called after FROM here. Functions: "
-            f"{', '.join(sorted(allowed['table']['functions']))}."
+            f"{', '.join(sorted(table_functions))}."
         )
-    if not after_from and not any(name in functions for functions in allowed["query"].values()):
+    if not after_from and name not in frozenset().union(*allowed_words()["query"].values()):
         raise QuestionError(
             f"the function {printable(name)!r} cannot be called here: only functions that compute "
             "a value of their arguments can."
