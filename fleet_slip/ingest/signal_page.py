@@ -11,8 +11,6 @@ from fleet_slip.ingest.draft import Draft
 from fleet_slip.ingest.guess import Guess
 from fleet_slip.pages.page import WIDTH_IN, Picture, colour, draw, fill_in
 
-MAX_POINTS = 2000
-"""Maximum points of a curve. Of longer signals the extremes of equal parts are drawn."""
 _PANEL_IN = 1.1
 
 
@@ -37,13 +35,13 @@ def write_signal_page(catalog: SignalCatalog, draft: Draft) -> str:
 def _panels(
     catalog: SignalCatalog, draft: Draft, guesses: list[tuple[str, Guess]], titles: list[str]
 ) -> Figure:
-    """Draw one panel for each signal over time in s."""
+    """Draw one panel for each signal over time in s; Matplotlib leaves out invisible points."""
     figure = Figure(figsize=(WIDTH_IN, _PANEL_IN * len(guesses) + 0.5), layout="constrained")
     axes = figure.subplots(len(guesses), 1, sharex=True, squeeze=False)[:, 0]
     for panel, (name, guess), title in zip(axes, guesses, titles, strict=True):
         rate_hz = guess.profile.rate_hz or draft.time.rate_hz or 1.0
-        time_s, values = thinned(in_si(catalog, name, guess), rate_hz)
-        panel.plot(time_s, values, color=colour("model_4"), linewidth=0.8)
+        values = in_si(catalog, name, guess)
+        panel.plot(np.arange(values.size) / rate_hz, values, color=colour("model_4"), linewidth=0.8)
         panel.set_title(title)
     axes[-1].set_xlabel("time in s")
     return figure
@@ -57,16 +55,3 @@ def in_si(catalog: SignalCatalog, name: str, guess: Guess) -> FloatArray:
     column = SignalColumn.model_validate(guess.entry)
     gain, bias = column.linear(catalog[name].unit)
     return np.asarray(gain * values + bias, dtype=np.float64)
-
-
-def thinned(values: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
-    """Return times in s and values; of many values the extremes of equal parts."""
-    time_s = np.arange(values.size) / rate_hz
-    size = 2 * values.size // MAX_POINTS
-    if size < 2:
-        return time_s, values
-    parts = values[: values.size // size * size].reshape(-1, size)
-    filled = np.where(np.isfinite(parts), parts, np.nan)
-    with np.errstate(all="ignore"):
-        low, high = np.fmin.reduce(filled, axis=1), np.fmax.reduce(filled, axis=1)
-    return np.repeat(time_s[: parts.size : size], 2), np.column_stack([low, high]).ravel()

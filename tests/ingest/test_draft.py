@@ -18,7 +18,7 @@ from fleet_slip.ingest.draft import draft_mapping, write_draft
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.measured_log import open_measured
 from fleet_slip.ingest.profile import profile_file
-from fleet_slip.ingest.signal_page import in_si, thinned
+from fleet_slip.ingest.signal_page import in_si
 from fleet_slip.ingest.ticks import MeasuredDrive
 from fleet_slip.ingest.vocabulary import unit_called
 from fleet_slip.quality.drive_signals import RADIUS_M, WHEELS
@@ -366,11 +366,10 @@ def test_the_mapped_signals_are_drawn_in_si_units(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         in_si(SIGNALS, "ay", draft.guesses["ay"]), 9.80665 * columns["ay [g]"], rtol=1e-6
     )
-    time_s, values = thinned(columns["ay [g]"], 100.0)
-    assert time_s.size <= 2100 and np.ptp(values) == np.ptp(columns["ay [g]"])
     page, log = tmp_path / "page.html", str(tmp_path / "log.csv")
     call(tmp_path / "root", "mapping", "suggest", log, "--plot", str(page))
     text = page.read_text()
+    assert len(text) < 200_000
     assert "ay of ay [g], m/s^2" in text and "yaw_rate (doubtful) of gz" in text
 
 
