@@ -211,7 +211,8 @@ def suggest(
 
     draft, name = _draft(catalog, file, can), name_of(Path(file).stem)
     text = write_draft(draft, name)
-    signals = {guess.profile.channel.name: name for name, guess in draft.guesses.items()}
+    sure = {name: guess for name, guess in draft.guesses.items() if not guess.is_doubtful}
+    signals = {guess.column: name for name, guess in sure.items()}
     channels = [
         {
             "channel": profile.channel.name,

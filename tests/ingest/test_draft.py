@@ -1,5 +1,6 @@
 """Drafts of mappings: of cars whose signals are known, and of logs as departments write them."""
 
+import json
 import re
 import shlex
 import tomllib
@@ -371,6 +372,9 @@ def test_the_mapped_signals_are_drawn_in_si_units(tmp_path: Path) -> None:
     text = page.read_text()
     assert len(text) < 200_000
     assert "ay of ay [g], m/s^2" in text and "yaw_rate (doubtful) of gz" in text
+    listed = json.loads(call(tmp_path / "root", "mapping", "suggest", log, "--json"))["channels"]
+    signals = {channel["channel"]: channel["signal"] for channel in listed}
+    assert signals == {"t_s": None, "ay [g]": "ay", "gz": None}
 
 
 def test_answers_fill_in_what_a_draft_leaves_open(tmp_path: Path) -> None:
