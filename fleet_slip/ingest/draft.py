@@ -178,12 +178,12 @@ def _comment(text: str) -> str:
     )
 
 
-def _signal_lines(guess: Guess) -> str:
+def _signal_lines(guess: Guess, is_doubtful: bool) -> str:
     """Return the keys of a signal on one line, or on a line each if one is too long."""
     line = f"{guess.signal} = {_value(guess.entry)}"
     if len(line) >= _COLUMNS:
         line = _lines({f"{guess.signal}.{key}": value for key, value in guess.entry.items()})
-    return re.sub("(?m)^", "# ", line) if guess.is_doubtful else line
+    return re.sub("(?m)^", "# ", line) if is_doubtful else line
 
 
 def _lines(keys: Mapping[str, Any]) -> str:

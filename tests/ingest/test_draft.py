@@ -317,6 +317,8 @@ def test_units_in_names_are_read_and_weak_names_without_a_unit_are_questions(
     assert 'steer = { column = "deltawheel_rad", unit = "rad" }' in lines
     assert 'brake_pressure = { column = "pBrakeR_bar", unit = "bar" }' in lines
     assert '# vehicle_speed = { column = "v", unit = "choose" }' in lines
+    two = draft_of(tmp_path, ay_mps2=3, pBrakeF_bar=20, pBrakeR_bar=18)
+    assert two.count("\n# brake_pressure = {") == 2 and "\nbrake_pressure" not in two
     assert "r_Nm" not in text
     flat = " ".join(line.removeprefix("#").strip() for line in lines)
     assert 'course = { column = "yawAngle_rad", unit = "rad", clockwise_from_north' in flat
