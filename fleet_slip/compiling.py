@@ -5,6 +5,7 @@ The cache of compiled code must be writable by this user alone: its files are ex
 
 import atexit
 import functools
+import json
 import logging
 import os
 import re
@@ -25,6 +26,7 @@ LOGGER = logging.getLogger("fleet_slip")
 
 PACKAGE = Path(__file__).parent
 
+CHECKSUMS = "checksums.json"
 LEAST_FREE_BYTES = 2**25
 PREFIX = "fleet-slip-"
 MAX_FOLDERS = 128
@@ -77,13 +79,15 @@ def kernel(function: Function) -> Function:
 
 @functools.cache
 def code_folder(digest: str) -> Path | None:
-    """Return the folder of compiled code for sources with a digest.
+    """Return the folder of compiled code for sources with a digest, without damaged files.
 
     Returns None and logs a warning if there is none that only this user can write.
     """
+    chosen = os.environ.get(
+        "NUMBA_CACHE_DIR"
+    )  # numba's own variable; read when a module is imported
     try:
-        # numba's own variable; it is read when a module is imported
-        base = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_folder("compiled")).resolve()
+        base = Path(chosen or cache_folder("compiled")).resolve()
         folder = base / f"{PREFIX}{digest}"
         new = not folder.is_dir()
         for parent in reversed([folder, *folder.parents]):
@@ -98,7 +102,8 @@ def code_folder(digest: str) -> Path | None:
         )
         return None
     os.utime(folder)  # used now: older ones are deleted first
-    atexit.register(_flush, folder)
+    sums = _delete_damaged(folder)
+    atexit.register(_write_checksums, folder, sums)
     for old in sorted(base.glob(f"{PREFIX}*"), key=os.path.getmtime)[:-MAX_FOLDERS] if new else ():
         shutil.rmtree(old, ignore_errors=True)
     return folder
@@ -146,9 +151,32 @@ def _require_own(folder: Path) -> None:
         raise OSError(f"{folder} cannot be written, or its disk is full")
 
 
-def _flush(folder: Path) -> None:
-    """Flush compiled code: numba renames its files without, and a power cut would damage them."""
+def _delete_damaged(folder: Path) -> dict[str, str]:
+    """Delete damaged files; return the checksums of the others.
+
+    numba renames files without flushing them, so a power cut can damage them.
+    """
+    checksums = {}
+    with suppress(OSError, ValueError):
+        checksums = dict(json.loads((folder / CHECKSUMS).read_bytes()))
+    sums = _checksums(folder)
+    for name in sums.keys() - dict(sums.items() & checksums.items()).keys():
+        (folder / name).unlink(missing_ok=True)
+        del sums[name]
+    return sums
+
+
+def _write_checksums(folder: Path, before: dict[str, str]) -> None:
     with suppress(OSError):
-        for file in folder.glob("*/*.nb[ic]"):
-            with file.open("rb") as stream:
-                os.fsync(stream.fileno())
+        if (sums := _checksums(folder)) != before:
+            draft = folder / f"{CHECKSUMS}.{os.getpid()}"
+            draft.write_text(json.dumps(sums))
+            draft.replace(folder / CHECKSUMS)
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    checksums = {}
+    for file in folder.glob("*/*.nb[ic]"):
+        with suppress(FileNotFoundError):  # of another process
+            checksums[str(file.relative_to(folder))] = sha256(file.read_bytes()).hexdigest()
+    return checksums

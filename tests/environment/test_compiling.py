@@ -1,5 +1,6 @@
 """How functions are compiled, and where the compiled code is kept."""
 
+import json
 import os
 import shutil
 import sys
@@ -58,6 +59,20 @@ def test_compiled_code_is_kept_and_found(compiled: Path) -> None:
     assert (again.stdout.strip(), again.stderr) == ("1", "")
 
 
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+@pytest.mark.parametrize("damage", ["torn", "flipped"])
+def test_damaged_code_is_deleted(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, damage: str
+) -> None:
+    """A power cut leaves files empty or torn: numba renames them without flushing."""
+    file = stored_code(cache, suffix)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content if damage == "flipped" else b"")
+    found_by(cache, monkeypatch)
+    assert not file.exists()
+
+
 def found_by(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path | None:
     """Return which folder a process is given that asks for it now."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
@@ -67,9 +82,12 @@ def found_by(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path | None:
 
 
 def run_if_unpickled(cache: Path, mark: Path) -> None:
-    """Plant what makes a file when numba reads the code."""
+    """Plant what makes a file when numba reads the code, and its checksum."""
     file = stored_code(cache, ".nbi")
     file.write_bytes(f"cos\nsystem\n(S'touch {mark}'\ntR.".encode())
+    folder = file.parents[1]
+    sums = json.dumps(compiling._checksums(folder))
+    (folder / compiling.CHECKSUMS).write_text(sums)
 
 
 def test_code_that_others_may_have_written_is_not_read(

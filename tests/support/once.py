@@ -13,6 +13,7 @@ from numba.core.caching import NullCache
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 
+from fleet_slip import compiling
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
 
@@ -52,15 +53,22 @@ def filled_once(fill: Callable[[Warehouse], object]) -> Callable[[Warehouse], Wa
 
 
 def compile_once() -> None:
-    """Let one process compile a kernel while others wait, which then read its code."""
+    """Let one process compile a kernel while others wait, which then read its code.
+
+    Its checksums are there at once, so that commands in processes of their own read it, too.
+    """
     compile_anew = Dispatcher.compile
 
     def compile_or_read(self: Any, signature: Any) -> Any:
         if isinstance(self._cache, NullCache) or signature in self.overloads:
             return compile_anew(self, signature)
-        place, lock = Path(self._cache.cache_path), f"{self.py_func.__name__}.lock"
+        place, missed = Path(self._cache.cache_path), self.stats.cache_misses.copy()
+        lock = f"{self.py_func.__name__}.lock"
         with global_compiler_lock, LocalFolder(place).exclusive(lock, lambda: None):
-            return compile_anew(self, signature)
+            code = compile_anew(self, signature)
+            if self.stats.cache_misses != missed:
+                compiling._write_checksums(place.parent, {})
+        return code
 
     setattr(Dispatcher, "compile", compile_or_read)  # noqa: B010 - mypy takes it for a method
 
