@@ -23,8 +23,10 @@ ShowStep = Callable[[str, int, int], None]
 """Like `ShowProgress`, with the name of the step first."""
 
 Workers = int | str | Executor | None
-"""Where tasks run, with the same result: a number of threads (None: one per core), the address of a
-Dask scheduler such as `tcp://10.0.0.1:8786`, or an executor.
+"""Place where tasks run, with the same result.
+
+A number of threads (None: one per core), the address of a Dask scheduler such as
+`tcp://10.0.0.1:8786`, or an executor.
 """
 
 

@@ -18,7 +18,10 @@ from fleet_slip.errors import UsageError
 def score(
     context: Context,
     model: opt.Model = None,
-    cohort: opt.OtherCohort = None,
+    cohort: Annotated[
+        str | None,
+        Option(help="SQL predicate on the view drives. Default: drives outside the training."),
+    ] = None,
     include_faulty: opt.IncludeFaulty = False,
     json: opt.Json = False,
 ) -> None:
@@ -55,12 +58,27 @@ def predict(
 def evaluate(
     context: Context,
     model: opt.Model = None,
-    compare: Annotated[list[str] | None, Option(help="Another model. May be repeated.")] = None,
-    scenario: Annotated[list[str] | None, Option(help="Scenario. May be repeated.")] = None,
+    compare: Annotated[
+        list[str] | None, Option(help="Another model to evaluate beside it. May be repeated.")
+    ] = None,
+    scenario: Annotated[
+        list[str] | None,
+        Option(
+            help="Scenario of configs/scenarios, or a TOML file. May be repeated. Default: all."
+        ),
+    ] = None,
     blind: Annotated[
-        bool, Option("--blind", help="Evaluate on random drives, drawn from the version's hash.")
+        bool,
+        Option(
+            "--blind",
+            help="Evaluate on random roads, cars, weather and drivers, drawn from the hash of the "
+            "version: unknown before it was published.",
+        ),
     ] = False,
-    cohort: opt.OtherCohort = None,
+    cohort: Annotated[
+        str | None,
+        Option(help="SQL predicate on the view drives: evaluate on these measured drives instead."),
+    ] = None,
     include_faulty: opt.IncludeFaulty = False,
     vehicle: opt.Vehicle = None,
     threads: opt.Threads = None,
@@ -110,12 +128,19 @@ def evaluate(
 def identify(
     context: Context,
     name: Annotated[str, Argument(help="Name of the car.")],
-    vehicle: Annotated[str, Option(help="TOML file with measured data of the car.")],
+    vehicle: Annotated[
+        str,
+        Option(
+            help="Measured data of the car: a TOML file with mass_kg, front_axle_m and rear_axle_m."
+        ),
+    ],
     cohort: opt.Cohort = TRAINING_DRIVES,
     threads: opt.Threads = None,
-    output: Annotated[Path | None, Option(help="Vehicle file to write.")] = None,
+    output: Annotated[
+        Path | None, Option(help="Vehicle file to write, for --vehicle and --with-filter.")
+    ] = None,
     campaign: Annotated[
-        Path | None, Option(help="Campaign file to write, for publish --prior.")
+        Path | None, Option(help="Campaign file with the car to write, for publish --prior.")
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -147,7 +172,9 @@ def identify(
 def report(
     context: Context,
     model: opt.Model = None,
-    output: Annotated[Path | None, Option(help="Default: report/ in the data root.")] = None,
+    output: Annotated[
+        Path | None, Option(help="Folder to write into. Default: report/ in the data root.")
+    ] = None,
     json: opt.Json = False,
 ) -> None:
     """Write a page that compares the latest evaluation with the paper's figures.
@@ -170,11 +197,21 @@ def report(
 
 def watch(
     context: Context,
-    drive: Annotated[str, Argument(metavar="SCENARIO|DRIVE", help="Scenario or logged drive.")],
+    drive: Annotated[
+        str,
+        Argument(
+            metavar="SCENARIO|DRIVE",
+            help="A scenario, or a logged drive by its drive_id, name or file.",
+        ),
+    ],
     model: opt.Model = None,
-    output: Annotated[Path, Option(help="Page to write, .html.")] = Path("watch.html"),
+    output: Annotated[Path, Option(help="Page to write, .html. It plays in a browser.")] = Path(
+        "watch.html"
+    ),
     from_s: Annotated[float, Option("--from", help="First second of the drive.")] = 0.0,
-    until_s: Annotated[float | None, Option("--until", help="Last second.")] = None,
+    until_s: Annotated[
+        float | None, Option("--until", help="Last second. Default: the end.")
+    ] = None,
 ) -> None:
     """Show a drive: the car on its track, its angle and the estimate, wheels and gates.
 
@@ -191,7 +228,9 @@ def explore(
     context: Context,
     edit: Annotated[bool, Option("--edit", help="Show the code, for editing.")] = False,
     port: Annotated[int | None, Option(min=1, max=65535, help="Port on this machine.")] = None,
-    headless: Annotated[bool, Option("--headless", help="Open no browser.")] = False,
+    headless: Annotated[
+        bool, Option("--headless", help="Print the address, and open no browser.")
+    ] = False,
 ) -> None:
     """Explore a data root in the browser: cohorts by mouse, error maps, coefficients, drift.
 

@@ -154,14 +154,26 @@ def _print_version(requested: bool) -> None:
 def options(
     context: Context,
     root: Annotated[
-        str | None, Option(help="Data root: a folder or a URL. Default: $FLEET_SLIP_ROOT, or data.")
+        str | None,
+        Option(
+            help="Data root: a folder, or the URL of an object store, such as s3://BUCKET/PATH. "
+            "Default: $FLEET_SLIP_ROOT, else ./data."
+        ),
     ] = None,
     config: Annotated[
-        str | None, Option(help="Folder of own configs. Default: $FLEET_SLIP_CONFIG.")
+        str | None,
+        Option(
+            help="Folder of configs that override the shipped ones (docs/configuration.md). "
+            "Default: $FLEET_SLIP_CONFIG."
+        ),
     ] = None,
     lineage: Annotated[  # noqa: ARG001 - read by `recorded`
         str | None,
-        Option(envvar="FLEET_SLIP_LINEAGE", help="File or URL for OpenLineage events."),
+        Option(
+            envvar="FLEET_SLIP_LINEAGE",
+            help="File or URL (http://HOST:PORT) for OpenLineage events of commands that change "
+            "the data root.",
+        ),
     ] = None,
     _version: Annotated[
         bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version.")

@@ -45,7 +45,8 @@ def simulate(
     days: opt.CampaignDays = None,
     through: opt.Through = None,
     engine: Annotated[
-        Literal["kernel", "highway-env"], Option(help="highway-env is slower; same logs.")
+        Literal["kernel", "highway-env"],
+        Option(help="The compiled kernel, or highway-env's vehicle: slower, the same logs."),
     ] = "kernel",
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
@@ -71,13 +72,22 @@ def ingest(
     context: Context,
     files: Annotated[list[str], Argument(help="Log files or folders.")],
     mapping: Annotated[
-        str | None, Option(help="Mapping of configs/mappings, or a TOML file; none for Gram rows.")
+        str | None,
+        Option(
+            help="Mapping of configs/mappings, or a TOML file. Without it, the files are tables of "
+            "Gram rows."
+        ),
     ] = None,
     dry_run: Annotated[
         bool, Option("--dry-run", help="Store nothing; exit code 10 if anything looks wrong.")
     ] = False,
     replace: Annotated[
-        bool, Option("--replace", help="Replace the drives of the same recordings.")
+        bool,
+        Option(
+            "--replace",
+            help="Replace the drives of the same recordings, such as after a correction of the "
+            "mapping.",
+        ),
     ] = False,
     cluster: opt.Cluster = None,
     json: opt.Json = False,
@@ -192,9 +202,11 @@ def mapping() -> None:
 def suggest(
     context: Context,
     file: Annotated[str, Argument(help="A measured log, or the folder of a lake of CAN messages.")],
-    output: Annotated[Path | None, Option(help="File to write. Default: stdout.")] = None,
+    output: Annotated[Path | None, Option(help="File for the draft. Default: stdout.")] = None,
     can: Annotated[Path | None, Option(help="Database of a CAN trace: DBC, KCD or SYM.")] = None,
-    plot: Annotated[Path | None, Option(help="Page of the mapped signals to write, .html.")] = None,
+    plot: Annotated[
+        Path | None, Option(help="Page to write, .html: the mapped signals in SI units.")
+    ] = None,
     json: opt.Json = False,
 ) -> None:
     """List the channels of a measured log, and draft a mapping for it.
@@ -297,12 +309,16 @@ def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "Draft":
 def gram(
     context: Context,
     features: Annotated[
-        str, Option(help="Feature set of configs/features.toml, signals (the logged ones), or all.")
+        str,
+        Option(help="Feature set of configs/features.toml, or all; signals is the logged signals."),
     ] = "signals",
-    cohort: opt.OtherCohort = None,
+    cohort: Annotated[
+        str | None,
+        Option(help="SQL predicate on the view drives: read only log files with such a drive."),
+    ] = None,
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
-    sql: Annotated[bool, Option("--sql", help="Print the SQL; compute nothing.")] = False,
+    sql: Annotated[bool, Option("--sql", help="Print the SQL statement; compute nothing.")] = False,
     json: opt.Json = False,
 ) -> None:
     """Reduce new log files to Gram rows, and drop the Gram rows of deleted files.
@@ -340,11 +356,18 @@ def gram(
 
 def features(
     context: Context,
-    sets: Annotated[bool, Option("--sets", help="List the feature sets.")] = False,
+    sets: Annotated[
+        bool, Option("--sets", help="List the feature sets instead of the features.")
+    ] = False,
     sql: Annotated[
-        str | None, Option(help="Print the query over log_counts that computes this column.")
+        str | None,
+        Option(
+            help="Print the query over log_counts that computes this feature, window or factor."
+        ),
     ] = None,
-    files: Annotated[bool, Option("--files", help="List the config files in use.")] = False,
+    files: Annotated[
+        bool, Option("--files", help="List the config files in use, and their folders.")
+    ] = False,
     everything: opt.All = False,
     json: opt.Json = False,
 ) -> None:

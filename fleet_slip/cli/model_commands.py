@@ -36,7 +36,10 @@ def select(
     half_life: opt.HalfLife = None,
     prior: opt.Prior = None,
     save: Annotated[
-        Path | None, Option(metavar="LIST.toml", help="Model list to write, for publish --models.")
+        Path | None,
+        Option(
+            metavar="LIST.toml", help="Write the compared models as a list, for publish --models."
+        ),
     ] = None,
     everything: opt.All = False,
     json: opt.Json = False,
@@ -67,7 +70,10 @@ def select(
 def publish(
     context: Context,
     name: opt.ModelName,
-    cohort: opt.OtherCohort = None,
+    cohort: Annotated[
+        str | None,
+        Option(help="SQL predicate on the view drives. Default: the champion's, or all drives."),
+    ] = None,
     include_faulty: opt.IncludeFaulty = False,
     models: opt.ModelList = None,
     label: opt.Label = None,
@@ -75,11 +81,19 @@ def publish(
     half_life: opt.HalfLife = None,
     prior: opt.Prior = None,
     with_filter: Annotated[
-        str | None, Option(help="Combine it with a filter in this car, or none for no filter.")
+        str | None,
+        Option(
+            help="Combine the model with a Kalman filter in this car, or none. Default: the "
+            "champion's."
+        ),
     ] = None,
-    force: Annotated[bool, Option("--force", help="Publish even a worse model.")] = False,
+    force: Annotated[
+        bool, Option("--force", help="Publish even a model that is worse than the champion.")
+    ] = False,
     candidate: opt.Candidate = False,
-    dry_run: Annotated[bool, Option("--dry-run", help="Publish nothing.")] = False,
+    dry_run: Annotated[
+        bool, Option("--dry-run", help="Print what would be published; publish nothing.")
+    ] = False,
     json: opt.Json = False,
 ) -> None:
     """Select from a model list and publish the winner as a model's next version, its champion.
@@ -129,9 +143,15 @@ def diagnose(
     model: opt.Model = None,
     cohort: opt.Cohort = TRAINING_DRIVES,
     signals: Annotated[
-        str | None, Option(help="Signals to fit instead, separated by commas; or catalogue.")
+        str | None,
+        Option(
+            help="Signals to fit instead of a published model, separated by commas; catalogue is "
+            "all inputs."
+        ),
     ] = None,
-    features: Annotated[str | None, Option(help="Feature set of --signals.")] = None,
+    features: Annotated[
+        str | None, Option(help="Feature set of --signals. Default: the logged signals.")
+    ] = None,
     json: opt.Json = False,
 ) -> None:
     """Fit a model's signals to a cohort and examine the fit, from Gram rows.
@@ -258,10 +278,13 @@ def diff(context: Context, first: opt.Version, second: opt.Version, json: opt.Js
 def export(
     context: Context,
     to: Annotated[
-        Literal["json", "c", "sql", "dbc", "onnx", "fmu", "mlflow"], Option(help="Target.")
+        Literal["json", "c", "sql", "dbc", "onnx", "fmu", "mlflow"],
+        Option(help="Target of the export; mlflow registers the version at --uri."),
     ],
     model: opt.Model = None,
-    output: Annotated[Path, Option(help="Folder to write into; replaces files.")] = Path(),
+    output: Annotated[
+        Path, Option(help="Folder to write into; files of the same names are replaced.")
+    ] = Path(),
     with_gram: Annotated[
         bool, Option("--with-gram", help="With C: also the code for Gram rows on board.")
     ] = False,

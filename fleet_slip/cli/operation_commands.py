@@ -38,7 +38,9 @@ def status(
 
 def contract(
     context: Context,
-    output: Annotated[Path | None, Option(help="File to write. Default: stdout.")] = None,
+    output: Annotated[
+        Path | None, Option(help="File to write, .odcs.yaml. Default: stdout.")
+    ] = None,
 ) -> None:
     """Write the data contract of the views in ODCS 3.1: columns, units, ranges and keys.
 
@@ -68,7 +70,8 @@ def calibrate(
     context: Context,
     cohort: opt.Cohort = ALL_DRIVES,
     car: Annotated[
-        str | None, Option(help="vehicle_id: print its parameters, also as on-board constants.")
+        str | None,
+        Option(help="vehicle_id: print the parameters of this car, also as on-board constants."),
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -85,8 +88,13 @@ def calibrate(
 def monitor(
     context: Context,
     model: opt.Model = None,
-    cohort: opt.OtherCohort = None,
-    since: Annotated[str | None, Option(help="First new day, YYYY-MM-DD.")] = None,
+    cohort: Annotated[
+        str | None, Option(help="SQL predicate on the view drives. Default: that of the training.")
+    ] = None,
+    since: Annotated[
+        str | None,
+        Option(help="First new day, YYYY-MM-DD. Default: the day after the training data."),
+    ] = None,
     json: opt.Json = False,
 ) -> None:
     """Chart a model's error on each day since its training, with control limits.
@@ -102,13 +110,21 @@ def monitor(
 
 def verify(
     context: Context,
-    full: Annotated[bool, Option("--full", help="Compute all Gram rows again.")] = False,
+    full: Annotated[
+        bool, Option("--full", help="Compute the Gram rows of all log files again.")
+    ] = False,
     grams: Annotated[
         bool, Option("--grams", help="Compute some Gram rows in several ways; compare the bits.")
     ] = False,
-    repair: Annotated[bool, Option("--repair", help="Rebuild damaged Gram rows.")] = False,
+    repair: Annotated[
+        bool, Option("--repair", help="Rebuild damaged Gram rows from the logs.")
+    ] = False,
     accept_loss: Annotated[
-        list[str] | None, Option(help="Lost FOLDER/NUMBER.json, or FOLDER, to give up.")
+        list[str] | None,
+        Option(
+            help="Lost document without a backup to give up: FOLDER/NUMBER.json, or FOLDER for all "
+            "its documents. May be repeated."
+        ),
     ] = None,
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
@@ -138,9 +154,16 @@ def compact(
         int | None, Option(min=1, help="Maximum number of rows of a file. Default: 2,000,000.")
     ] = None,
     retention_hours: Annotated[
-        float | None, Option(min=1, max=168, help="Age of files to remove. Default: 168.")
+        float | None,
+        Option(
+            min=1,
+            max=168,
+            help="Hours for which files of replaced versions are kept. Default: 168, a week.",
+        ),
     ] = None,
-    dry_run: Annotated[bool, Option("--dry-run", help="List the files; change nothing.")] = False,
+    dry_run: Annotated[
+        bool, Option("--dry-run", help="List the files to be removed; change nothing.")
+    ] = False,
     json: opt.Json = False,
 ) -> None:
     """Merge the small log files of each day, and remove files that are out of use.
@@ -161,8 +184,12 @@ def forget(
     context: Context,
     vehicle: Annotated[str | None, Option(help="vehicle_id to erase.")] = None,
     drive: Annotated[str | None, Option(help="drive_id to erase.")] = None,
-    now: Annotated[bool, Option("--now", help="Delete old files at once.")] = False,
-    allow: Annotated[bool, Option("--allow", help="Accept its new rows again.")] = False,
+    now: Annotated[
+        bool, Option("--now", help="Delete old files at once, instead of by compact.")
+    ] = False,
+    allow: Annotated[
+        bool, Option("--allow", help="Accept new rows of the vehicle or drive again.")
+    ] = False,
     expired: Annotated[
         bool, Option("--expired", help="Erase drives older than the retention period.")
     ] = False,

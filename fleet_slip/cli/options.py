@@ -62,13 +62,16 @@ def complete_model(context: Context, incomplete: str) -> list[str]:
 Json = Annotated[bool, Option("--json", help="Print machine-readable JSON on stdout.")]
 All = Annotated[bool, Option("--all", help="Print all rows and columns.")]
 
-Threads = Annotated[int | None, Option(min=1, help="Threads. Default: one per core.")]
+Threads = Annotated[
+    int | None, Option(min=1, help="Threads on this machine. Default: one per core.")
+]
 Cluster = Annotated[
     str | None,
     Option(
         envvar="DASK_SCHEDULER_ADDRESS",
         metavar="ADDRESS",
-        help="Address of a Dask scheduler whose workers share the data root: tcp://10.0.0.1:8786.",
+        help="Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers share the "
+        "data root. Default: threads on this machine.",
     ),
 ]
 
@@ -93,16 +96,25 @@ Candidate = Annotated[
 ]
 
 Cohort = Annotated[str, Option(help="SQL predicate on the view drives.")]
-OtherCohort = Annotated[str | None, Option(help="SQL predicate on the view drives.")]
 IncludeFaulty = Annotated[
     bool, Option("--include-faulty", help="Include drives with faulty sensors.")
 ]
 Mapping = Annotated[str, Option(help="Mapping of configs/mappings, or a TOML file.")]
-CampaignDays = Annotated[int | None, Option(min=1, help="Simulate only the first N days.")]
-Through = Annotated[str | None, Option(help="Last day to simulate, YYYY-MM-DD or today.")]
-Retention = Annotated[str | None, Option(help="Default: retention.toml of the configs.")]
+CampaignDays = Annotated[
+    int | None, Option(min=1, help="Simulate only the first N days. Default: all.")
+]
+Through = Annotated[
+    str | None, Option(help="Last day to simulate, YYYY-MM-DD or today. Default: all days.")
+]
+Retention = Annotated[
+    str | None, Option(help="Retention file. Default: retention.toml of the configs.")
+]
 Vehicle = Annotated[
-    str | None, Option(help="Car of the filters: a vehicle of configs/vehicles, or a TOML file.")
+    str | None,
+    Option(
+        help="Car of the filters: a vehicle of configs/vehicles, or a TOML file with mass_kg, "
+        "front_axle_m and rear_axle_m."
+    ),
 ]
 
 # How models are selected.
@@ -114,7 +126,9 @@ ModelList = Annotated[
         "--features or without the Gram rows of estimator."
     ),
 ]
-OneModel = Annotated[str | None, Option(help='Inputs of one model, such as "ax, ay, yaw_rate".')]
+OneModel = Annotated[
+    str | None, Option(help='Inputs of one model instead of a list, such as "ax, ay, yaw_rate".')
+]
 Order = Annotated[
     str | None,
     Option(
@@ -128,7 +142,10 @@ Features = Annotated[
 ]
 Label = Annotated[
     Literal["course"] | None,
-    Option(help="Train without a reference sensor, on changes of the course over ground."),
+    Option(
+        help="Train without a reference sensor, on changes of the course over ground. The default "
+        "feature set and model list are then those called course."
+    ),
 ]
 FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "speed", "part"]
 GroupBy = Annotated[
@@ -136,21 +153,27 @@ GroupBy = Annotated[
 ]
 Folds = Annotated[
     str | None,
-    Option(metavar="NUMBER|each", help="Number of folds, or each group. Default: the list's."),
+    Option(
+        metavar="NUMBER|each",
+        help="Number of folds, or each for one fold per group. Default: the list's.",
+    ),
 ]
 Ranking = Annotated[
     str | None, Option(help="Ranking of inputs: declared (default), forward or backward.")
 ]
 Criterion = Annotated[
     str | None,
-    Option(help="Number of ranked inputs by cv (default; see --tolerance), aic or bic."),
+    Option(
+        help="Criterion for the number of ranked inputs: cv (the smallest model within --tolerance "
+        "of the best), aic or bic. Default: cv."
+    ),
 ]
 Tolerance = Annotated[
     str | None,
     Option(
-        help="Smallest gain that justifies another signal, as the root of the difference of the "
-        "mean squared errors. Models within it, or within one standard error, count as equal. "
-        "Default: 0.025deg, or the list's."
+        help="Smallest gain that justifies another signal, such as 0.025deg: the root of the "
+        "difference of the mean squared errors. Models within it, or within one standard error of "
+        "the difference, count as equal. Default: 0.025deg, or the list's."
     ),
 ]
 Robust = Annotated[
@@ -173,6 +196,7 @@ Prior = Annotated[
     str | None,
     Option(
         help="Campaign of configs/campaigns, or a TOML file, whose simulated drives join the "
-        "training with an eighth of the weight, unless they enlarge the error clearly."
+        "training with an eighth of the weight of all real rows, unless held-out drives have a "
+        "clearly larger error with them. See: fleet-slip identify --campaign."
     ),
 ]

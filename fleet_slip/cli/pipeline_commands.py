@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
 def demo(
     context: Context,
-    output: Annotated[Path, Option(help="Folder to write into.")] = Path("fleet-slip-demo"),
+    output: Annotated[Path, Option(help="Folder to write into: data, c and report.html.")] = Path(
+        "fleet-slip-demo"
+    ),
     open_page: Annotated[bool, Option("--open", help="Open the report in the browser.")] = False,
 ) -> None:
     """Simulate 12 drives, train a model, export it as C, and show it on another drive.
@@ -122,7 +124,10 @@ def run(
 def learn(
     context: Context,
     name: opt.ModelName,
-    logs: Annotated[list[str], Argument(help="Log files or folders.")],
+    logs: Annotated[
+        list[str],
+        Argument(help="Log files or folders; earlier files are skipped."),
+    ],
     mapping: opt.Mapping,
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
@@ -162,11 +167,17 @@ def nightly(
     models: opt.ModelList = None,
     candidate: opt.Candidate = False,
     retention: opt.Retention = None,
-    night: Annotated[str | None, Option(help="Date, YYYY-MM-DD. Default: today.")] = None,
+    night: Annotated[
+        str | None, Option(help="Date of the night, YYYY-MM-DD. Default: today.")
+    ] = None,
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
     output: Annotated[
-        Path | None, Option(help="Folder for the summary, NIGHT.txt and NIGHT.json.")
+        Path | None,
+        Option(
+            help="Folder for the summary: NIGHT.txt and NIGHT.json. The files name drives; forget "
+            "does not change them."
+        ),
     ] = None,
     json: opt.Json = False,
 ) -> None:

@@ -356,7 +356,7 @@ _INTEGERS: Mapping[str, Callable[..., Any]] = {
     "//": lambda a, b: _signed(np.abs(a) // b, a),
     "nearest": lambda a, b: _signed((2 * np.abs(a) + b) // (2 * b), a),
 }
-"""Those of int64."""
+"""Types of int64 columns."""
 
 
 class _RunningSum:

@@ -42,7 +42,7 @@ _UNIT_FITS = 4.0
 _SIGN_WORDS = {"vz", "vorzeichen", "sign", "signum", "sgn"}
 
 Keys: TypeAlias = Mapping[str, Any]
-"""Of a signal in a mapping."""
+"""Keys of a signal in a mapping."""
 
 
 @dataclass(frozen=True)

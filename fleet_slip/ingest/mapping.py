@@ -223,7 +223,7 @@ class Mapping(Config):
         dict[str, SignalColumn], BeforeValidator(split_components), Field(min_length=1)
     ]
     label: LabelSensor | None = added(None)
-    """Where the label's sensor is, and whether it measures two velocities instead of an angle."""
+    """Position of the label's sensor, which may measure two velocities instead of an angle."""
     vehicle: VehicleMeasures | None = added(None)
     """Measured data of the car, for a filter beside the model: `fleet-slip learn`."""
     where: tuple[RowCondition, ...] = added((), max_length=MAX_CONDITIONS)

@@ -35,7 +35,7 @@ from fleet_slip.warehouse.warehouse import Warehouse
 
 TableName: TypeAlias = Literal["quarantine", "logs"]
 Replace: TypeAlias = Literal["no", "corrected", "all"]
-"""Which stored recordings a new one replaces: `corrected` are those of the same file, ingested with
+"""Stored recordings that a new one replaces: `corrected` are those of the same file, ingested with
 an earlier mapping of the same name."""
 
 

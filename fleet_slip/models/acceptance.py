@@ -220,7 +220,7 @@ class ChallengerEvaluation:
 
 
 MAX_REVIEWED_DRIVES = 20_000
-"""Of a larger cohort about this many drives, chosen by their hash, are compared."""
+"""Maximum number of drives in the comparison; a larger cohort is sampled by the drives' hashes."""
 
 _HEX = 4
 

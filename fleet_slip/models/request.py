@@ -33,10 +33,10 @@ DEFAULT_MODELS = "estimator"
 """The model list that is compared unless another is named, by `run` and every night too."""
 
 LOGGED_MODELS = "table1"
-"""That of logged signals, for other feature sets or where the usual columns are not computed."""
+"""List of logged signals, for other feature sets or if the usual columns are not computed."""
 
 Label = Literal["course"]
-"""What may stand for the label of a reference sensor."""
+"""Substitutes for the label of a reference sensor."""
 
 COURSE_MODELS = COURSE_FEATURES = "course"
 """The model list, and the feature set, that are taken for it."""

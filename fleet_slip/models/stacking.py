@@ -34,7 +34,7 @@ MAX_GROWTH = 2
 """A first-stage model is fitted again where the cohort has this many times its drives."""
 
 About = dict[str, Any]
-"""Of a `FirstStageModel`: its `estimate`, `scale`, `models`, their checksum, set and cohort."""
+"""Content of a `FirstStageModel`: `estimate`, `scale`, `models`, their checksum, set and cohort."""
 
 
 def ensure_rows(

@@ -17,10 +17,10 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
 WIDTH_IN = 10.4
-"""Of a figure: at a scale of 1 its text is as large as small print on the page."""
+"""Width of a figure, such that its text at scale 1 has the size of small print on the page."""
 
 BINS = int(WIDTH_IN * 72 / 1.5)
-"""That a series over the whole width is cut into: a point and a half each."""
+"""Number of bins of a series over the full width: one and a half points each."""
 
 
 @dataclass(frozen=True)

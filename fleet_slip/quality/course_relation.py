@@ -34,9 +34,9 @@ from fleet_slip.quality.drive_signals import (
 # -1, one that stands still of 0; an antenna elsewhere or a late fix moves l.
 
 COLUMNS = ("curvature", "ay", YAW_RATE, TURNED)
-"""Of a Gram row of changes, before the label."""
+"""Columns of a Gram row of changes, before the label."""
 USUAL_LEVER_M, USUAL_COMPLIANCE = 1.35, 0.006
-"""Of a passenger car: l in m and K in rad per m/s²."""
+"""Values of a passenger car: l in m and K in rad per m/s²."""
 MIN_CHANGES = 100
 MIN_TURNED_RAD = 0.05
 LEVERS_M = (CHECKS["place of the antenna"].low, CHECKS["place of the antenna"].high)

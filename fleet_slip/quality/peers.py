@@ -352,13 +352,13 @@ def _leading_signs(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
 
 
 MIN_CARS = 4
-"""Of a day or file, and of the others: a median of fewer cars shows their differences."""
+"""Minimum number of cars of a day or file, and of the others: fewer differ in their median."""
 
 OFFSET, GAIN = 0, 1
 """Columns of a drive's figures: the mean residual in counts, and the logarithm of the gain."""
 
 MIN_GAIN = 1e-3
-"""Of a label that does not follow its prediction at all, so that it has a logarithm."""
+"""Gain of a label that does not follow its prediction, so that its logarithm exists."""
 
 
 def find_odd_days(

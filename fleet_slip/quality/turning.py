@@ -31,12 +31,12 @@ WITNESSES: Mapping[str, Mapping[str, int]] = {
     "front wheels": {"wheel_fl": -1, "wheel_fr": 1},
     "rear wheels": {"wheel_rl": -1, "wheel_rr": 1},
 }
-"""What is positive in a left turn, as a combination of signals."""
+"""Combinations of signals that are positive in a left turn."""
 AXLES = ("front wheels", "rear wheels")
 MIN_WITNESSES = 3
 """In a Gram row, which includes rows of a car that stands or drives backwards."""
 MIN_WHEEL_DIFFERENCE = 0.5
-"""Of the track width times the yaw rate, in the mean: a smaller difference of two wheels has no
+"""Share of track width times yaw rate, in the mean: a smaller difference of two wheels has no
 sign. It is of one speed that is logged in place of four, at different delays."""
 MIN_LOADING = 0.2
 """A loading nearer to zero has no clear sign."""
@@ -44,7 +44,7 @@ ROUNDING = 1e-12
 """Share of the variances of two equal signals that rounding leaves in their difference."""
 
 MAX_STEERING_RATIO = 1.0
-"""Of track over wheelbase: beyond it a sensor is biased."""
+"""Maximum multiple of track over wheelbase: beyond it a sensor is biased."""
 UNBIASED_STEERING = 0.8
 """Share of drives that must have such a ratio, of either sign, for its sign to mean anything: the
 wheels differ by some 0.04 deg in the mean, and sensors by more."""
