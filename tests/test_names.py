@@ -1,4 +1,4 @@
-"""Names and docstrings of the package, and imports between tests."""
+"""Names and docstrings of the package, tests, benchmarks and jobs, and imports between tests."""
 
 import ast
 from collections import Counter
@@ -15,6 +15,12 @@ TREES = {
     path.relative_to(PACKAGE): ast.parse(path.read_text(encoding="utf-8"))
     for path in sorted(PACKAGE.rglob("*.py"))
 }
+FOLDERS = (PACKAGE, TESTS, TESTS.parent / "benchmarks", TESTS.parent / "jobs")
+MODULES = {
+    str(path.relative_to(folder.parent)): ast.parse(path.read_text(encoding="utf-8"))
+    for folder in FOLDERS
+    for path in sorted(folder.rglob("*.py"))
+}
 
 VAGUE_NAMES = frozenset(
     {
@@ -30,6 +36,11 @@ STORED_KEYS = frozenset({"of", "made"})
 
 VAGUE_OPENINGS = ("Of ", "What ", "That ", "Whether ", "So many ", "Which ", "Where ", "Those ")
 """Beginnings of docstrings without a subject or a verb."""
+
+VAGUE_TESTS = tuple(
+    f"test_{word}_" for word in ("what", "whatever", "of", "that", "where", "who", "whoever")
+)
+"""Beginnings of names of tests without a subject."""
 
 
 def assigned_names(tree: ast.AST) -> Iterator[str]:
@@ -61,19 +72,33 @@ def vague_names(tree: ast.AST) -> list[str]:
 
 
 def vague_docstrings(tree: ast.AST) -> list[str]:
-    """Return the docstrings of a module that begin vaguely."""
-    documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
-    docstrings = (ast.get_docstring(n) or "" for n in ast.walk(tree) if isinstance(n, documented))
+    """Return the docstrings of a module, and of its constants and fields, that begin vaguely."""
+    docstrings = [
+        node.value.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        if isinstance(node.value.value, str)
+    ]
     return [text.splitlines()[0] for text in docstrings if text.startswith(VAGUE_OPENINGS)]
 
 
 def test_every_name_says_what_it_is() -> None:
-    assert not {str(path): names for path, tree in TREES.items() if (names := vague_names(tree))}
+    assert not {path: names for path, tree in MODULES.items() if (names := vague_names(tree))}
 
 
 def test_docstrings_have_a_subject_and_a_verb() -> None:
-    texts = {str(path): vague_docstrings(tree) for path, tree in TREES.items()}
+    texts = {path: vague_docstrings(tree) for path, tree in MODULES.items()}
     assert not {path: lines for path, lines in texts.items() if lines}
+
+
+def test_names_of_tests_have_a_subject() -> None:
+    tests = {
+        node.name
+        for path, tree in MODULES.items()
+        for node in ast.walk(tree)
+        if path.startswith("tests/") and isinstance(node, ast.FunctionDef)
+    }
+    assert not {name for name in tests if name.startswith(VAGUE_TESTS)}
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,8 @@ def bent_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
         done_on(root, "gram", "--features", "motion")
-        own = write_list(root.with_name("bent.toml"), *nested(FEATURES), features="motion")
-        done_on(root, "publish", "bent", "--models", own)
+        list_path = write_list(root.with_name("bent.toml"), *nested(FEATURES), features="motion")
+        done_on(root, "publish", "bent", "--models", list_path)
 
     return made_once(tmp_path_factory, "bent", make)
 

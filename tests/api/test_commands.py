@@ -1,4 +1,4 @@
-"""What commands do, done in Python: on a folder and on an object store, with the same bits."""
+"""Commands as Python methods: on a folder and on an object store, with the same bits."""
 
 import threading
 from collections.abc import Iterator
@@ -84,10 +84,10 @@ def test_a_call_that_changes_the_warehouse_is_in_the_history_of_runs(filled: Fle
 
 def test_only_what_the_history_may_keep_is_kept(tmp_path: Path) -> None:
     vehicle = "WVWZZZ1JZXW000001"
-    own = fleet_slip.open(tmp_path / "own")
+    fleet_ = fleet_slip.open(tmp_path / "own")
     (tmp_path / "own").mkdir()
     with pytest.raises(QuestionError):
-        own.maintenance.forget(vehicle=vehicle)
+        fleet_.maintenance.forget(vehicle=vehicle)
     history = [file for file in (tmp_path / "own/runs").iterdir() if file.suffix == ".jsonl"]
     text = "".join(file.read_text() for file in history)
     assert "forget" in text
@@ -102,8 +102,8 @@ def test_running_again_selects_again_where_anything_is_new(tmp_path: Path) -> No
     steps: list[str] = []
 
     def selects(**changes: Any) -> bool:
-        asked = {"days": 1, "models": "table1", **changes}
-        report = fleet.run("smoke", progress=lambda step, *_: steps.append(step), **asked)
+        options = {"days": 1, "models": "table1", **changes}
+        report = fleet.run("smoke", progress=lambda step, *_: steps.append(step), **options)
         return report.selection is not None
 
     assert [selects(), selects()] == [True, False]
@@ -143,15 +143,15 @@ def test_a_campaign_without_such_days_is_refused(fleet: Fleet) -> None:
 def test_measured_files_are_ingested_and_reported_in_their_order(tmp_path: Path) -> None:
     fleet = fleet_slip.open(tmp_path / "data")
     files, mapping = _measured(tmp_path)
-    each: list[str] = []
+    names: list[str] = []
     seen: list[tuple[int, int]] = []
     reports = fleet.ingest(
         files,
         mapping,
-        on_report=lambda report: each.append(report.file),
+        on_report=lambda report: names.append(report.file),
         progress=lambda done, total: seen.append((done, total)),
     )
-    assert [report.file for report in reports] == each == [str(file) for file in files]
+    assert [report.file for report in reports] == names == [str(file) for file in files]
     assert all(report.new for report in reports)
     assert seen[-1] == (len(files), len(files))
     (again,) = fleet.ingest(str(files[0]), mapping)
@@ -187,14 +187,14 @@ def _measured(folder: Path) -> tuple[list[Path], str]:
 def test_two_threads_publish_one_model(smoke_copy: Path) -> None:
     fleet = fleet_slip.open(smoke_copy)
     selection = fleet.cohort().select(models="table1")
-    made: list[object] = []
+    versions: list[object] = []
     threads = [
-        threading.Thread(target=lambda: made.append(fleet.models.publish("slip", selection)))
+        threading.Thread(target=lambda: versions.append(fleet.models.publish("slip", selection)))
         for _ in range(2)
     ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(120)
-    assert len(made) == 2
+    assert len(versions) == 2
     assert fleet.models.versions("slip").num_rows == 1

@@ -1,4 +1,4 @@
-"""Where the package reads the environment."""
+"""Modules of the package that read the environment."""
 
 import re
 from pathlib import Path
@@ -20,9 +20,9 @@ READERS = {
 
 
 def test_no_other_module_reads_the_environment() -> None:
-    found = {
+    modules = {
         file.relative_to(PACKAGE).as_posix()
         for file in PACKAGE.rglob("*.py")
         if re.search(r"\benviron\b|\bgetenv\b", file.read_text(encoding="utf-8"))
     }
-    assert found == {*READERS}
+    assert modules == {*READERS}

@@ -47,9 +47,9 @@ def test_the_lines_that_help_shows_work(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.chdir(tmp_path)
     lines = [line[4:] for line in fleet_slip.__doc__.splitlines() if line.startswith("    ")]
     assert len(lines) == 9
-    known: dict[str, object] = {}
-    exec("\n".join(lines), known)  # noqa: S102
-    assert len(known["beta_rad"]) == len(known["log"])  # type: ignore[arg-type]
+    namespace: dict[str, object] = {}
+    exec("\n".join(lines), namespace)  # noqa: S102
+    assert len(namespace["beta_rad"]) == len(namespace["log"])  # type: ignore[arg-type]
 
 
 def test_a_relation_keeps_its_connection(fleet: Fleet) -> None:
@@ -74,7 +74,7 @@ def test_a_long_query_of_an_interactive_python_prints_nothing(fleet: Fleet) -> N
 
 
 @pytest.mark.parametrize(
-    ("query", "said"),
+    ("query", "message"),
     [
         ("COPY (SELECT 1) TO 'x.csv'", "only queries are allowed"),
         ("DROP VIEW log", "only queries are allowed"),
@@ -86,8 +86,10 @@ def test_a_long_query_of_an_interactive_python_prints_nothing(fleet: Fleet) -> N
         ("SELECT 'a' ||", "not valid SQL"),
     ],
 )
-def test_a_query_reads_the_warehouse_and_nothing_else(fleet: Fleet, query: str, said: str) -> None:
-    with pytest.raises(QuestionError, match=said):
+def test_a_query_reads_the_warehouse_and_nothing_else(
+    fleet: Fleet, query: str, message: str
+) -> None:
+    with pytest.raises(QuestionError, match=message):
         fleet.sql(query)
 
 

@@ -50,12 +50,12 @@ def test_it_publishes_and_says_what_it_assumed_and_what_comes_next(
 ) -> None:
     folder, first, _ = learned
     assert first.exit_code == 0, first.stderr
-    for said in (
+    for phrase in (
         "ingested 6 drives, 3,000 rows",
         "published golf@1. It is the first version.",
         "assumptions, since own has no other values:\n  side-slip sensor at the centre of gravity",
     ):
-        assert said in first.stderr
+        assert phrase in first.stderr
     _, _, lines = first.stderr.partition("next:\n")
     commands = [line.split(f"--root {folder / 'root'} ")[1] for line in lines.splitlines()]
     assert [line.split()[0] for line in commands] == ["show", "export", "evaluate"]
@@ -64,17 +64,17 @@ def test_it_publishes_and_says_what_it_assumed_and_what_comes_next(
 def test_the_second_time_there_is_nothing_to_do(learned: tuple[Path, Finished, Finished]) -> None:
     _, _, again = learned
     assert again.exit_code == 0, again.stderr
-    found = json.loads(again.stdout)
-    assert (found["changed"], found["ingest"], found["select"]) == (False, [], None)
-    assert found["publish"]["version"] == 1
-    assert "sideslip is not delayed (delay_s)" in found["assumed"]
+    document = json.loads(again.stdout)
+    assert (document["changed"], document["ingest"], document["select"]) == (False, [], None)
+    assert document["publish"]["version"] == 1
+    assert "sideslip is not delayed (delay_s)" in document["assumed"]
 
 
 def test_cars_and_days_are_those_of_the_paths(learned: tuple[Path, Finished, Finished]) -> None:
     folder, _, _ = learned
     fleet = fleet_slip.open(folder / "root")
-    found = fleet.sql("SELECT vehicle_id, day::VARCHAR FROM drives ORDER BY 1").fetchall()
-    assert found == [(f"car-{car}", "2026-05-04") for car in range(6)]
+    rows = fleet.sql("SELECT vehicle_id, day::VARCHAR FROM drives ORDER BY 1").fetchall()
+    assert rows == [(f"car-{car}", "2026-05-04") for car in range(6)]
 
 
 def test_show_and_exports_list_the_assumptions(
@@ -124,7 +124,7 @@ def test_a_corrected_mapping_takes_the_place_of_the_old_one(
     ax = mapping.signals["ax"].model_copy(update={"negate": True})
     corrected = mapping.model_copy(update={"signals": {**mapping.signals, "ax": ax}})
     report = fleet.learn("golf", folder / "logs", corrected)
-    assert sum(one.drives_replaced for one in report.ingested) == 6
+    assert sum(item.drives_replaced for item in report.ingested) == 6
     assert report.problem is None
     assert fleet.sql("SELECT count(*) FROM drives").fetchall() == [(6,)]
 
@@ -159,7 +159,7 @@ SPEED = {"column": "v", "unit": "km/h", "radius_m": 0.3}
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"wheel_fl": {"column": "v", "unit": "km/h", "radius_m": 0.31}}, "wheel radius 0.31 m"),
         ({"steer": {"column": "s", "unit": "deg"}}, "both front wheels steer alike"),
@@ -168,9 +168,9 @@ SPEED = {"column": "v", "unit": "km/h", "radius_m": 0.3}
         ({}, "side-slip sensor at the centre of gravity"),
     ],
 )
-def test_what_a_mapping_leaves_open_is_named(changed: dict[str, object], said: str) -> None:
+def test_open_keys_of_a_mapping_are_named(changed: dict[str, object], message: str) -> None:
     mapping = Mapping.model_validate(
         {"name": "m", "time": TIME, "drive": DRIVE, "signals": {**SIGNALS, **changed}},
         context=CATALOG.signals,
     )
-    assert any(text.startswith(said) for text in assumptions_of(mapping))
+    assert any(text.startswith(message) for text in assumptions_of(mapping))

@@ -66,9 +66,9 @@ def champions_by(folder: Path, old: str, new: str) -> Iterator[None]:
 @pytest.fixture(scope="module", autouse=True)
 def forgiving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Rules that let small differences pass: of few drives they are large. One file is verified."""
-    own = tmp_path_factory.mktemp("forgiving") / "configs"
+    folder = tmp_path_factory.mktemp("forgiving") / "configs"
     with (
-        champions_by(own, "tolerance_deg = 0.025", "tolerance_deg = 1.0  "),
+        champions_by(folder, "tolerance_deg = 0.025", "tolerance_deg = 1.0  "),
         pytest.MonkeyPatch.context() as patch,
     ):
         patch.setattr(pipelines, "SAMPLE_FILES", 1)
@@ -117,10 +117,10 @@ def run_night(place: Path, night: int, *options: str) -> Finished:
 
 
 def figures(report: NightReport) -> dict[str, Any]:
-    """What a summary says, but for how it came to that."""
-    told = report.as_dict()
-    del told["seconds"]
-    return {**told, "steps": [(one.name, one.state) for one in report.steps]}
+    """Return the figures of a summary, without times."""
+    document = report.as_dict()
+    del document["seconds"]
+    return {**document, "steps": [(step.name, step.state) for step in report.steps]}
 
 
 def test_a_night_brings_in_what_is_new_and_writes_its_summary(
@@ -129,11 +129,11 @@ def test_a_night_brings_in_what_is_new_and_writes_its_summary(
     land(landing, 2)
     done = run_night(place, 2, "--json", "--output", str(tmp_path / "out"))
     assert done.exit_code == 0, done.stderr
-    told = done.json
-    assert (told["drives"], told["new_drives"], told["champion"]) == (8, 2, "smoke@3")
-    assert told["champion_before"] == "smoke@2"
-    assert {step["state"] for step in told["steps"]} == {"done", "left out"}
-    assert json.loads((tmp_path / f"out/{day_of(2)}.json").read_text()) == told
+    document = done.json
+    assert (document["drives"], document["new_drives"], document["champion"]) == (8, 2, "smoke@3")
+    assert document["champion_before"] == "smoke@2"
+    assert {step["state"] for step in document["steps"]} == {"done", "left out"}
+    assert json.loads((tmp_path / f"out/{day_of(2)}.json").read_text()) == document
     assert "2 drives" in (tmp_path / f"out/{day_of(2)}.txt").read_text()
     again = str(give(place, 3))
     assert "0 new rows" in again
@@ -150,8 +150,8 @@ def test_a_fleet_that_counts_on_board_alone_has_nights(place: Path, tmp_path: Pa
     for night in range(2):
         rows = []
         for car in range(12):
-            told = counts(drive(rng, gentleness=2.0))
-            matrix = np.column_stack([told[name].astype(np.int64) for name in names])
+            counts_of_drive = counts(drive(rng, gentleness=2.0))
+            matrix = np.column_stack([counts_of_drive[name].astype(np.int64) for name in names])
             gram = Gram.from_counts(names, matrix)
             rows.append(row_of(gram, f"VIN{car}", START_S + 86_400 * night))
         fleet.import_onboard_grams(write_counted(tmp_path / f"{night}", rows))
@@ -264,7 +264,7 @@ def refused(place: Path, night: int, **options: Any) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize(
-    ("options", "exit_code", "told"),
+    ("options", "exit_code", "message"),
     [
         ({"cohort": "no such thing"}, 5, "quality failed"),
         ({"models": "no-such-list"}, 3, "gram failed"),
@@ -272,11 +272,11 @@ def refused(place: Path, night: int, **options: Any) -> tuple[int, str]:
     ],
 )
 def test_a_step_that_fails_is_named(
-    place: Path, options: dict[str, Any], exit_code: int, told: str
+    place: Path, options: dict[str, Any], exit_code: int, message: str
 ) -> None:
     code, problem = refused(place, 2, **options)
     assert code == exit_code
-    assert told in problem
+    assert message in problem
 
 
 def test_before_anything_has_landed_it_says_so(tmp_path: Path, smoke_root: Path) -> None:
@@ -289,7 +289,7 @@ def test_before_anything_has_landed_it_says_so(tmp_path: Path, smoke_root: Path)
     assert refused(tmp_path, 0)[0] == 4
 
 
-def test_what_means_nothing_is_refused_before_anything_is_written(
+def test_meaningless_options_are_refused_before_anything_is_written(
     run_command: Callable[..., Finished], tmp_path: Path
 ) -> None:
     done = run_command(
@@ -340,11 +340,11 @@ def test_drives_are_left_out_by_hashes_that_do_not_name_them() -> None:
     parse_predicate(SIGNALS, predicate)
     assert "car" not in predicate
     with duckdb.connect() as database:
-        left = database.execute(
+        excluded = database.execute(
             "SELECT drive_id FROM (VALUES ('car''s <1>', 1320), ('b', 1320), ('c', 1320)) "
             f"AS drives(drive_id, mass_kg) WHERE {predicate}"
         ).fetchall()
-    assert left == [("c",)]
+    assert excluded == [("c",)]
     assert without_drives("true", "fleet", []) == "true"
 
 

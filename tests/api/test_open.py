@@ -76,7 +76,7 @@ def test_a_selection_is_not_affected_by_opening_another_root(fleets: tuple[Fleet
     assert after.as_dict() == before.as_dict()
     assert before.winner.model.signals == ("ay", "ay_mean_16")
     assert other.winner.model.signals == ("yaw_rate",)
-    identities = {one.as_dict()["feature_set"] for one in (after, other)}
+    identities = {selection.as_dict()["feature_set"] for selection in (after, other)}
     assert len(identities) == 2, "the same name is of two definitions"
     columns = [
         {name for name, *_ in fleet.sql("DESCRIBE log").fetchall()} for fleet in (first, second)

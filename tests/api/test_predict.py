@@ -40,8 +40,8 @@ def model(intercept: float, **coefficients: float) -> ModelVersion:
         )
         for name, coefficient in coefficients.items()
     )
-    own = {"intercept": intercept, "intercept_exact": Fraction(intercept), "terms": terms}
-    return ModelVersion(1, manifest().model_copy(update=own), "", CATALOG)
+    document = {"intercept": intercept, "intercept_exact": Fraction(intercept), "terms": terms}
+    return ModelVersion(1, manifest().model_copy(update=document), "", CATALOG)
 
 
 LINEAR = model(0.25, ay=-0.0085, yaw_rate=0.0123, steering_wheel=0.1)
@@ -109,10 +109,10 @@ def listed(angles: Any) -> Column:
     return [None if x is None or math.isnan(x) else x for x in values]
 
 
-def on_every_kind(one: ModelVersion, columns: dict[str, Column]) -> Column:
+def on_every_kind(version: ModelVersion, columns: dict[str, Column]) -> Column:
     answers = []
     for make, kind in KINDS.items():
-        angles = one.predict(make(columns))
+        angles = version.predict(make(columns))
         assert isinstance(angles, kind), make
         answers.append(listed(angles))
     assert all(answer == answers[0] for answer in answers)
@@ -144,8 +144,8 @@ def logged(x: float, signal: str) -> float:
 
 def valid(x: float | None, column: str) -> float | None:
     """A value; None where it is beyond its valid range."""
-    (one,) = (one for one in SIGNALS.signals.values() if one.column == column)
-    if x is None or not one.min_count <= round(x / float(one.scale)) <= one.max_count:
+    (signal,) = (signal for signal in SIGNALS.signals.values() if signal.column == column)
+    if x is None or not signal.min_count <= round(x / float(signal.scale)) <= signal.max_count:
         return None
     return x
 
@@ -185,14 +185,14 @@ def test_columns_are_those_of_the_signals_each_once() -> None:
 
 
 def test_the_bits_on_the_logs_are_those_of_a_dot_product_in_sql(fleet: Fleet) -> None:
-    one = LINEAR
-    terms = [f"{term.coefficient!r} * {term.column}" for term in one.manifest.terms]
-    estimate = " + ".join([repr(one.manifest.intercept), *terms])
-    complete = " AND ".join(f"{column} IS NOT NULL" for column in one.columns)
+    version = LINEAR
+    terms = [f"{term.coefficient!r} * {term.column}" for term in version.manifest.terms]
+    estimate = " + ".join([repr(version.manifest.intercept), *terms])
+    complete = " AND ".join(f"{column} IS NOT NULL" for column in version.columns)
     rows = fleet.sql(
         f"SELECT {estimate} AS estimate_rad FROM log WHERE {complete} ORDER BY drive_id, tick"
     ).pl()
-    angles = one.predict(fleet.sql("FROM log ORDER BY drive_id, tick").pl())
+    angles = version.predict(fleet.sql("FROM log ORDER BY drive_id, tick").pl())
     assert angles.name == "sideslip_rad"
     assert len(angles) > 50_000
     assert angles.drop_nulls().to_list() == rows["estimate_rad"].to_list()
@@ -200,8 +200,8 @@ def test_the_bits_on_the_logs_are_those_of_a_dot_product_in_sql(fleet: Fleet) ->
 
 def test_a_relation_is_a_frame(fleet: Fleet) -> None:
     relation = fleet.sql("FROM log ORDER BY drive_id, tick LIMIT 100")
-    one = fleet.models.get("smoke")
-    assert one.predict(relation).to_pylist() == one.predict(relation.pl()).to_list()
+    version = fleet.models.get("smoke")
+    assert version.predict(relation).to_pylist() == version.predict(relation.pl()).to_list()
 
 
 def test_numbers_of_every_type_are_taken() -> None:
@@ -227,9 +227,11 @@ def test_a_missing_column_is_named_and_so_are_those_there(
     make: Callable[[dict[str, Column]], Any],
 ) -> None:
     frame = make({name: x for name, x in GOOD.items() if name != "ay_mps2"})
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as caught:
         LINEAR.predict(frame)
-    assert "the frame lacks ay_mps2. It has yaw_rate_rad_s, steering_wheel_rad." in str(told.value)
+    assert "the frame lacks ay_mps2. It has yaw_rate_rad_s, steering_wheel_rad." in str(
+        caught.value
+    )
 
 
 def test_a_frame_without_columns_and_one_with_many() -> None:
@@ -256,13 +258,13 @@ def test_a_frame_without_columns_and_one_with_many() -> None:
     ],
     ids=str,
 )
-def test_what_is_no_column_of_numbers_is_refused(wrong: Any) -> None:
+def test_a_column_without_numbers_is_refused(wrong: Any) -> None:
     with pytest.raises(InputError, match="the column ay_mps2 is"):
         LINEAR.predict({**GOOD, "ay_mps2": wrong})
 
 
 @pytest.mark.parametrize(
-    ("frame", "said"),
+    ("frame", "message"),
     [
         ({**GOOD, "ay_mps2": [1.0]}, "differ in length: ay_mps2 1, yaw_rate_rad_s 2"),
         ({**GOOD, "ay_mps2": [1.0, math.inf]}, "ay_mps2 has 1 infinite values"),
@@ -276,8 +278,8 @@ def test_what_is_no_column_of_numbers_is_refused(wrong: Any) -> None:
         (pd.concat([as_pandas(GOOD)] * 2, axis=1), "several columns ay_mps2"),
     ],
 )
-def test_what_is_no_frame_is_refused(frame: Any, said: str) -> None:
-    with pytest.raises(InputError, match=re.escape(said)):
+def test_an_object_that_is_no_frame_is_refused(frame: Any, message: str) -> None:
+    with pytest.raises(InputError, match=re.escape(message)):
         LINEAR.predict(frame)
 
 
@@ -286,13 +288,13 @@ def test_a_sum_beyond_float64_is_seen() -> None:
     assert big.predict({"ay_mps2": [30.0, -30.0, None]}).tolist()[:2] == [math.inf, -math.inf]
 
 
-@pytest.mark.parametrize(("ay", "there"), [(30.0, True), (30.00049, True), (30.00051, False)])
-@pytest.mark.parametrize("one", [LINEAR, BENT])
+@pytest.mark.parametrize(("ay", "is_present"), [(30.0, True), (30.00049, True), (30.00051, False)])
+@pytest.mark.parametrize("version", [LINEAR, BENT])
 def test_a_value_beyond_its_signals_range_is_missing(
-    one: ModelVersion, ay: float, there: bool
+    version: ModelVersion, ay: float, is_present: bool
 ) -> None:
     """30,000 counts of ay are valid; what is rounded to more is not."""
-    row = {name: [60.0] if name.startswith("wheel") else [0.1] for name in one.columns}
+    row = {name: [60.0] if name.startswith("wheel") else [0.1] for name in version.columns}
     for sign in (1, -1):
-        (angle,) = one.predict({**row, "ay_mps2": [sign * ay]})
-        assert np.isfinite(angle) == there
+        (angle,) = version.predict({**row, "ay_mps2": [sign * ay]})
+        assert np.isfinite(angle) == is_present

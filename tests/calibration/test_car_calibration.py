@@ -84,8 +84,8 @@ def gram_row(car: str, number: int, counts: dict[str, Any]) -> dict[str, Any]:
 def row_of(columns: Sequence[str], counts: Any, drive: str, car: str = "car") -> dict[str, Any]:
     """Return the Gram row of counts, shape (rows, columns)."""
     gram = Gram.from_counts(columns, counts.astype(np.int64))
-    known = {"vehicle_id": car, "day": DAY, "drive_id": drive, "signals": ",".join(columns)}
-    return known | {"n": gram.n, "sums": list(gram.sums), "products": list(gram.products)}
+    facts = {"vehicle_id": car, "day": DAY, "drive_id": drive, "signals": ",".join(columns)}
+    return facts | {"n": gram.n, "sums": list(gram.sums), "products": list(gram.products)}
 
 
 def evidence(rows: list[dict[str, Any]], size: int = 7) -> CarEvidence:
@@ -93,14 +93,20 @@ def evidence(rows: list[dict[str, Any]], size: int = 7) -> CarEvidence:
     return CarEvidence(CATALOG, collect_sums(batches, KINDS))
 
 
-def calibrated(found: CarEvidence, car: str) -> dict[str, CalibratedParameter]:
+def calibrated(evidence_: CarEvidence, car: str) -> dict[str, CalibratedParameter]:
     return {
-        k: one for k, one in found.parameters(car).items() if isinstance(one, CalibratedParameter)
+        k: parameter
+        for k, parameter in evidence_.parameters(car).items()
+        if isinstance(parameter, CalibratedParameter)
     }
 
 
-def refusals(found: CarEvidence, car: str) -> dict[str, str]:
-    return {name: one for name, one in found.parameters(car).items() if isinstance(one, str)}
+def refusals(evidence_: CarEvidence, car: str) -> dict[str, str]:
+    return {
+        name: reason
+        for name, reason in evidence_.parameters(car).items()
+        if isinstance(reason, str)
+    }
 
 
 @pytest.fixture(scope="module")
@@ -121,36 +127,36 @@ def fleet() -> tuple[list[dict[str, Any]], dict[str, dict[str, float]]]:
 
 def test_offsets_lie_within_their_stated_uncertainty(fleet: Any) -> None:
     rows, true = fleet
-    found = evidence(rows)
+    evidence_ = evidence(rows)
     for name in TRUE:
         errors = []
         for car, offsets in true.items():
-            one = calibrated(found, car)[name]
-            assert one.uncertainty is not None
-            errors.append((one.value - offsets[name]) / one.uncertainty)
-        # Of 40 standard normal numbers: mean within 3 / sqrt(40), variance within 3 sqrt(2 / 40).
+            parameter = calibrated(evidence_, car)[name]
+            assert parameter.uncertainty is not None
+            errors.append((parameter.value - offsets[name]) / parameter.uncertainty)
+        # 40 standard normal numbers: mean within 3 / sqrt(40), variance within 3 sqrt(2 / 40).
         assert abs(np.mean(errors)) < 0.48, name
         assert 0.33 < np.mean(np.square(errors)) < 1.67, name
         assert np.mean(np.abs(errors) < 2) > 0.85, name
 
 
 def test_more_drives_make_it_surer_as_was_stated(fleet: Any) -> None:
-    found = evidence(fleet[0])
+    evidence_ = evidence(fleet[0])
 
     def after(car: str, first: int, last: int) -> tuple[dict[Any, float], dict[Any, float]]:
-        at = found.slices(car, first, last)
-        estimates = found.estimate(at)
-        values = {name: float(one.value) for name, one in estimates.items()}
-        return values, found.uncertainties(estimates, at)
+        at = evidence_.slices(car, first, last)
+        estimates = evidence_.estimate(at)
+        values = {name: float(estimate.value) for name, estimate in estimates.items()}
+        return values, evidence_.uncertainties(estimates, at)
 
-    one, other, two = (
-        [after(car, *drives) for car in found.cars] for drives in ((0, 1), (1, 2), (0, 2))
+    single, other, repeated = (
+        [after(car, *drives) for car in evidence_.cars] for drives in ((0, 1), (1, 2), (0, 2))
     )
     for name in TRUE:
-        stated = np.mean([errors[name] ** 2 for _, errors in one])
-        apart = [a[name] - b[name] for (a, _), (b, _) in zip(one, other, strict=True)]
+        stated = np.mean([errors[name] ** 2 for _, errors in single])
+        apart = [a[name] - b[name] for (a, _), (b, _) in zip(single, other, strict=True)]
         assert 0.6 < np.sqrt(np.mean(np.square(apart)) / 2 / stated) < 1.6, name
-        with_two = np.mean([errors[name] ** 2 for _, errors in two])
+        with_two = np.mean([errors[name] ** 2 for _, errors in repeated])
         assert 0.55 < np.sqrt(with_two / stated) < 0.8, name  # 1 / sqrt(2), about
 
 
@@ -158,8 +164,8 @@ def test_the_numbers_are_the_same_in_any_order(fleet: Any) -> None:
     rows, _ = fleet
     shuffled = [*rows]
     random.Random(4).shuffle(shuffled)  # noqa: S311 - an order, no secret
-    one, other = evidence(rows), evidence(shuffled, size=11)
-    assert [calibrated(one, car) for car in one.cars] == [
+    ordered, other = evidence(rows), evidence(shuffled, size=11)
+    assert [calibrated(ordered, car) for car in ordered.cars] == [
         calibrated(other, car) for car in other.cars
     ]
 
@@ -167,11 +173,11 @@ def test_the_numbers_are_the_same_in_any_order(fleet: Any) -> None:
 def test_the_wheels_tell_the_radius_and_the_steering_the_wheelbase() -> None:
     rng = np.random.default_rng(3)
     rows = [gram_row("car", n, biased(rng, TRUE)) for n in range(4)]
-    found = calibrated(evidence(rows), "car")
-    assert found["speed_ratio"].value == pytest.approx(cars.RADIUS_M / 0.31, rel=1e-2)
-    wheelbase = found["steer_per_curvature"].value * found["speed_ratio"].value
+    parameters = calibrated(evidence(rows), "car")
+    assert parameters["speed_ratio"].value == pytest.approx(cars.RADIUS_M / 0.31, rel=1e-2)
+    wheelbase = parameters["steer_per_curvature"].value * parameters["speed_ratio"].value
     assert wheelbase == pytest.approx(cars.WHEELBASE_M, rel=0.08)  # noise flattens
-    assert found["understeer"].value == pytest.approx(0.002, abs=1e-3)
+    assert parameters["understeer"].value == pytest.approx(0.002, abs=1e-3)
 
 
 def on_real_roads(
@@ -198,22 +204,22 @@ def test_roads_that_lean_and_are_banked_are_taken_out() -> None:
             "ay_offset": 0.05 * rng.standard_normal(),
         }
         rows += [gram_row(car, n, on_real_roads(rng, true[car])) for n in range(3)]
-    found = evidence(rows)
-    assert found.roads.banked
-    assert found.roads.lean is not None
-    assert float(found.roads.lean) == pytest.approx(0.2, abs=0.06)
+    evidence_ = evidence(rows)
+    assert evidence_.roads.banked
+    assert evidence_.roads.lean is not None
+    assert float(evidence_.roads.lean) == pytest.approx(0.2, abs=0.06)
     for car, offsets in true.items():
         for name, offset in offsets.items():
-            one = calibrated(found, car)[name]
-            assert one.uncertainty is not None
-            assert abs(one.value - offset) < 4 * one.uncertainty, (car, name)
+            parameter = calibrated(evidence_, car)[name]
+            assert parameter.uncertainty is not None
+            assert abs(parameter.value - offset) < 4 * parameter.uncertainty, (car, name)
 
     alone = evidence([row for row in rows if row["vehicle_id"] < "car-08"])
     assert alone.roads.banked
     assert alone.roads.lean is None
     assert "ay_offset" not in calibrated(alone, "car-03")
     assert "10 cars" in refusals(alone, "car-03")["ay_offset"]
-    assert set(refusals(found, "car-03")) == {"slip_lever", "slip_compliance"}
+    assert set(refusals(evidence_, "car-03")) == {"slip_lever", "slip_compliance"}
 
 
 def test_one_drive_is_as_sure_as_it_is_where_roads_differ() -> None:
@@ -224,13 +230,13 @@ def test_one_drive_is_as_sure_as_it_is_where_roads_differ() -> None:
         for i in range(15)
         for n in range(4)
     ]
-    found = evidence(rows)
-    assert found.roads.banked
+    evidence_ = evidence(rows)
+    assert evidence_.roads.banked
     squares = []
-    for car in found.cars:
-        first = found.slices(car, 0, 1)
-        estimates = found.estimate(first)
-        if error := found.uncertainties(estimates, first).get("yaw_rate_offset"):
+    for car in evidence_.cars:
+        first = evidence_.slices(car, 0, 1)
+        estimates = evidence_.estimate(first)
+        if error := evidence_.uncertainties(estimates, first).get("yaw_rate_offset"):
             squares.append(float(estimates["yaw_rate_offset"].value) ** 2 / error**2)
     assert len(squares) > 12
     assert 0.33 < np.mean(squares) < 2
@@ -258,7 +264,7 @@ def test_the_lean_of_roads_is_what_the_cars_do_not_explain() -> None:
         ("other unit", NO_TYRE),
     ],
 )
-def test_what_driving_does_not_tell_is_left_out_and_why(kind: str, why: str) -> None:
+def test_parameters_without_evidence_are_left_out_with_a_reason(kind: str, why: str) -> None:
     rng = np.random.default_rng(5)
     signals = cars.drive(rng, 2.0)
     n = cars.TICKS
@@ -277,10 +283,10 @@ def test_what_driving_does_not_tell_is_left_out_and_why(kind: str, why: str) -> 
         scale = 15 / (0.31 * sum(signals[f"wheel_{c}"] for c in ("fl", "fr", "rl", "rr")) / 4)
         for corner in ("fl", "fr", "rl", "rr"):
             signals[f"wheel_{corner}"] = signals[f"wheel_{corner}"] * scale
-    found = evidence([gram_row("car", n, cars.counts(signals)) for n in range(2)])
-    missing = refusals(found, "car")
+    evidence_ = evidence([gram_row("car", n, cars.counts(signals)) for n in range(2)])
+    missing = refusals(evidence_, "car")
     for name in ("yaw_rate_offset", "ay_offset", "speed_ratio", "steering_offset"):
-        assert name not in calibrated(found, "car")
+        assert name not in calibrated(evidence_, "car")
         assert missing[name] == why
     assert missing["slip_lever"] == NO_RECEIVER
 
@@ -301,16 +307,16 @@ def test_a_warehouse_says_what_is_missing_and_forgets(warehouse: Warehouse) -> N
     with pytest.raises(DataError, match="fleet-slip gram --features calibration"):
         calibrate(warehouse)
     update_grams(warehouse, feature_set="calibration")
-    found = calibrate(warehouse)
-    assert set(found.cars) == {"alfa", "beta", "gamma"}
-    for car in found.cars:
+    calibration = calibrate(warehouse)
+    assert set(calibration.cars) == {"alfa", "beta", "gamma"}
+    for car in calibration.cars:
         for name, value in TRUE.items():
-            one = found.car(car)[name]  # type: ignore[index]
-            assert one.uncertainty is not None
-            assert abs(one.value - value) < 5 * one.uncertainty
+            parameter = calibration.car(car)[name]  # type: ignore[index]
+            assert parameter.uncertainty is not None
+            assert abs(parameter.value - value) < 5 * parameter.uncertainty
     assert "10 cars or more separate the two" in str(done_on(warehouse.root, "calibrate"))
     with pytest.raises(QuestionError, match="delta"):
-        found.car("delta")
+        calibration.car("delta")
     with pytest.raises(DataError, match="no drive of"):
         calibrate(warehouse, "vehicle_id = 'delta'")
 
@@ -318,15 +324,15 @@ def test_a_warehouse_says_what_is_missing_and_forgets(warehouse: Warehouse) -> N
     after = calibrate(warehouse)
     assert set(after.cars) == {"alfa", "gamma"}
     assert {c: after.cars[c]["ay_offset"].value for c in after.cars} == {
-        c: found.cars[c]["ay_offset"].value for c in after.cars
+        c: calibration.cars[c]["ay_offset"].value for c in after.cars
     }
     for numbers in after.cars.values():
-        one, grain = numbers["ay_offset"], float(CALIBRATION_PARAMETERS["ay_offset"].grain)
-        assert abs(one.value - one.count * grain) <= grain / 2
+        parameter, grain = numbers["ay_offset"], float(CALIBRATION_PARAMETERS["ay_offset"].grain)
+        assert abs(parameter.value - parameter.count * grain) <= grain / 2
 
 
 def test_a_car_that_stood_still_tells_the_bias_of_its_gyroscope() -> None:
-    """Of drives that are too straight to tell anything else; slow turns do not count as bias."""
+    """Drives that are too straight for other parameters; slow turns do not count as bias."""
     rng = np.random.default_rng(8)
     columns = ("yaw_rate", "wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
     rows = []
@@ -343,12 +349,12 @@ def test_a_car_that_stood_still_tells_the_bias_of_its_gyroscope() -> None:
             slow[f"wheel_{corner}"] = np.rint((5.0 * rolled + side * track) / 0.01)
         counts = np.stack([slow[name].astype(np.int64) for name in columns], axis=1)
         rows.append(row_of(columns, counts, rows[-1]["drive_id"]))
-    found = evidence(rows)
-    assert set(refusals(found, "car")) >= {"ay_offset", "steering_offset"}
-    one = calibrated(found, "car")["yaw_rate_offset"]
-    assert one.value == pytest.approx(0.0123, abs=2e-4)
-    assert one.uncertainty is not None and 0.0003 <= one.uncertainty < 0.001
-    assert (one.drives, one.rows) == (3, 12000)
+    evidence_ = evidence(rows)
+    assert set(refusals(evidence_, "car")) >= {"ay_offset", "steering_offset"}
+    parameter = calibrated(evidence_, "car")["yaw_rate_offset"]
+    assert parameter.value == pytest.approx(0.0123, abs=2e-4)
+    assert parameter.uncertainty is not None and 0.0003 <= parameter.uncertainty < 0.001
+    assert (parameter.drives, parameter.rows) == (3, 12000)
 
 
 RATIO, LEVER_M, COMPLIANCE, BIAS_RAD = 1.07, 1.3, -0.006, 0.004
@@ -373,9 +379,9 @@ def changes(rng: np.random.Generator) -> dict[str, Any]:
     label = LEVER_M * curvature + COMPLIANCE * ay + BIAS_RAD + 0.01 * turned
     label += 0.002 * rng.standard_normal(5000)
     scales = {name: float(scale) for name, scale in CATALOG.input_scales.items()}
-    wanted = {"curvature": curvature, "ay": ay, TURNED: turned, SIGNALS.label: label}
+    columns_by_name = {"curvature": curvature, "ay": ay, TURNED: turned, SIGNALS.label: label}
     scales |= {TURNED: turned_scale(SIGNALS), SIGNALS.label: float(SIGNALS[SIGNALS.label].scale)}
-    return {name: np.rint(values / scales[name]) for name, values in wanted.items()}
+    return {name: np.rint(values / scales[name]) for name, values in columns_by_name.items()}
 
 
 def stacked(columns: Sequence[str], counts: dict[str, Any]) -> Any:
@@ -383,7 +389,7 @@ def stacked(columns: Sequence[str], counts: dict[str, Any]) -> Any:
 
 
 @pytest.fixture(scope="module")
-def told() -> dict[str, CalibratedParameter]:
+def course_parameters() -> dict[str, CalibratedParameter]:
     rng = np.random.default_rng(5)
     sums: dict[str, DriveSums] = {}
     for name, make in ((BY_SATELLITE, levels), (BY_COURSE, changes)):
@@ -393,33 +399,43 @@ def told() -> dict[str, CalibratedParameter]:
         ]
         sums |= collect_sums([pa.RecordBatch.from_pylist(rows)], kinds_by_set(SIGNALS.label)[name])
     stated = CarEvidence(CATALOG, sums).parameters("car")
-    return {name: one for name, one in stated.items() if isinstance(one, CalibratedParameter)}
+    return {
+        name: parameter
+        for name, parameter in stated.items()
+        if isinstance(parameter, CalibratedParameter)
+    }
 
 
-def test_a_late_receiver_tells_the_speed_ratio(told: dict[str, CalibratedParameter]) -> None:
-    one = told["speed_ratio"]
-    assert one.value == pytest.approx(RATIO, abs=1e-3)
-    assert one.uncertainty is not None
-    assert 0.0012 <= one.uncertainty < 0.003
+def test_a_late_receiver_tells_the_speed_ratio(
+    course_parameters: dict[str, CalibratedParameter],
+) -> None:
+    parameter = course_parameters["speed_ratio"]
+    assert parameter.value == pytest.approx(RATIO, abs=1e-3)
+    assert parameter.uncertainty is not None
+    assert 0.0012 <= parameter.uncertainty < 0.003
 
 
-def test_the_course_tells_how_a_car_slips(told: dict[str, CalibratedParameter]) -> None:
-    assert told["slip_lever"].value == pytest.approx(LEVER_M, abs=0.01)
-    assert told["slip_compliance"].value == pytest.approx(COMPLIANCE, abs=1e-4)
-    bias = told["yaw_rate_offset"]  # over 4 s the heading gains that much, and the label lacks it
+def test_the_course_tells_how_a_car_slips(
+    course_parameters: dict[str, CalibratedParameter],
+) -> None:
+    assert course_parameters["slip_lever"].value == pytest.approx(LEVER_M, abs=0.01)
+    assert course_parameters["slip_compliance"].value == pytest.approx(COMPLIANCE, abs=1e-4)
+    bias = course_parameters[
+        "yaw_rate_offset"
+    ]  # over 4 s the heading gains that much, and the label lacks it
     assert bias.value == pytest.approx(-BIAS_RAD / 4, abs=3e-5)
     assert bias.uncertainty is not None and 1e-4 <= bias.uncertainty < 2e-4
 
 
 @pytest.mark.parametrize("times", [0, 5])
-def test_what_is_no_course_of_a_car_tells_nothing(times: int) -> None:
+def test_a_course_of_another_car_yields_nothing(times: int) -> None:
     """A heading has no lever; that of an antenna far away is none of a car."""
     counts = changes(np.random.default_rng(6))
     counts[SIGNALS.label] = times * counts[SIGNALS.label]
     columns = BY_SET[BY_COURSE]
     table = stacked(columns, counts).astype(np.int64)
-    told = estimate_parameters(
+    parameters = estimate_parameters(
         CarTerms(CATALOG), {"slip": Gram.from_counts(columns, table)}, banked=False
     )
-    assert {*told.values()} == {NO_COURSE, NO_CAR}
-    assert told["slip_lever"] == told["slip_compliance"] == NO_CAR
+    assert {*parameters.values()} == {NO_COURSE, NO_CAR}
+    assert parameters["slip_lever"] == parameters["slip_compliance"] == NO_CAR

@@ -50,19 +50,19 @@ LateFleet = Callable[..., Fleet]
 @pytest.fixture(scope="module")
 def late_fleet(tmp_path_factory: pytest.TempPathFactory) -> LateFleet:
     """Return a fleet of its own in a folder: each delay is simulated once."""
-    made: dict[float, Path] = {}
+    roots: dict[float, Path] = {}
 
     def fleet(folder: Path, delay_s: float, grams: Sequence[str] = ("delay",)) -> Fleet:
         (folder / "late.toml").write_text(CAMPAIGN.format(delay_s))
-        if delay_s not in made:
-            made[delay_s] = tmp_path_factory.mktemp("late") / "data"
-            first = fleet_slip.open(made[delay_s])
+        if delay_s not in roots:
+            roots[delay_s] = tmp_path_factory.mktemp("late") / "data"
+            first = fleet_slip.open(roots[delay_s])
             first.simulate(str(folder / "late.toml"))
             first.gram()
-        found = fleet_slip.open(shutil.copytree(made[delay_s], folder / "data"))
+        fleet_ = fleet_slip.open(shutil.copytree(roots[delay_s], folder / "data"))
         for name in grams:
-            found.gram(name)
-        return found
+            fleet_.gram(name)
+        return fleet_
 
     return fleet
 
@@ -75,26 +75,26 @@ def test_the_delay_is_found_with_its_uncertainty(
 ) -> None:
     fleet = late_fleet(tmp_path, delay_s)
     fleet.gram("calibration")
-    found = fleet.maintenance.calibrate()
-    (car,), (one,) = found.receivers.cars, found.receivers.cars.values()
-    assert one.drives == 8
-    assert abs(one.value - delay_s) < 0.005
-    assert one.uncertainty is not None
-    assert 0 < one.uncertainty < 0.005
-    assert abs(one.value - delay_s) < 3 * one.uncertainty + 0.001
-    assert found.as_dict()["receivers"]["cars"][car]["delay_s"] == one.value
-    assert f"its satellite receiver is late by {1000 * one.value:.0f} +- " in str(
-        [*found.parts(car)]
+    calibration = fleet.maintenance.calibrate()
+    (car,), (delay,) = calibration.receivers.cars, calibration.receivers.cars.values()
+    assert delay.drives == 8
+    assert abs(delay.value - delay_s) < 0.005
+    assert delay.uncertainty is not None
+    assert 0 < delay.uncertainty < 0.005
+    assert abs(delay.value - delay_s) < 3 * delay.uncertainty + 0.001
+    assert calibration.as_dict()["receivers"]["cars"][car]["delay_s"] == delay.value
+    assert f"its satellite receiver is late by {1000 * delay.value:.0f} +- " in str(
+        [*calibration.parts(car)]
     )
 
 
 def test_a_car_of_few_drives_is_as_sure_as_usual_drives_make_it() -> None:
-    known = ReceiverDelay(0.1, 0.004, 4, 9000, information=40.0, differing=3.0)
-    few = ReceiverDelay(0.09, None, 1, 2000, information=10_000.0, differing=0.0)
-    assert with_pooled({"a": few}) == {"a": few}
-    found = with_pooled({"a": few, "b": known})
-    assert found["b"] == known
-    assert found["a"].uncertainty == pytest.approx(math.sqrt(1 / 10_000 + 0.003**2))
+    certain = ReceiverDelay(0.1, 0.004, 4, 9000, information=40.0, differing=3.0)
+    uncertain = ReceiverDelay(0.09, None, 1, 2000, information=10_000.0, differing=0.0)
+    assert with_pooled({"a": uncertain}) == {"a": uncertain}
+    pooled = with_pooled({"a": uncertain, "b": certain})
+    assert pooled["b"] == certain
+    assert pooled["a"].uncertainty == pytest.approx(math.sqrt(1 / 10_000 + 0.003**2))
 
 
 def test_the_delay_of_a_type_is_told_by_its_cars(late_fleet: LateFleet, tmp_path: Path) -> None:
@@ -108,17 +108,17 @@ def test_the_delay_of_a_type_is_told_by_its_cars(late_fleet: LateFleet, tmp_path
     order = np.unique(rows["drive_id"].to_pylist(), return_inverse=True)[1]
     cars = cars.take(pa.array(order))
     rows = rows.set_column(rows.column_names.index("vehicle_id"), "vehicle_id", cars)
-    told = receiver_delays(rows.to_batches())
-    kind = told.types["box"]
+    delays = receiver_delays(rows.to_batches())
+    kind = delays.types["box"]
     assert abs(kind.mean - 0.087) < 0.005
     assert kind.mean_error < 0.003
     assert kind.spread + kind.spread_error < 0.01
-    assert all(abs(one.value - 0.087) < 0.005 for one in told.cars.values())
+    assert all(abs(delay.value - 0.087) < 0.005 for delay in delays.cars.values())
     several = pa.array(["telephone" if drive == 7 else "box" for drive in order])
     rows = rows.set_column(rows.column_names.index("receiver"), "receiver", several)
-    told = receiver_delays(rows.to_batches())
-    assert told.cars["e"].receiver is None
-    assert told.cars["a"].receiver == "box"
+    delays = receiver_delays(rows.to_batches())
+    assert delays.cars["e"].receiver is None
+    assert delays.cars["a"].receiver == "box"
 
 
 MODEL = "steering_mean_16,ay_mean_16,ay_square_mean_8,yaw_rate_speed_mean_8"
@@ -166,19 +166,17 @@ def test_gram_rows_follow_the_delay_that_more_drives_tell(
     assert fleet.maintenance.check_grams().wide_drives
 
 
-def test_what_a_forgotten_drive_told_of_the_delay_is_gone(
-    late_fleet: LateFleet, tmp_path: Path
-) -> None:
+def test_an_erased_drive_no_longer_affects_the_delay(late_fleet: LateFleet, tmp_path: Path) -> None:
     fleet = late_fleet(tmp_path, 0.087, grams=("course",))
     ((drive,), *_) = fleet.sql("SELECT min(drive_id) FROM drives").fetchall()
     fleet.maintenance.forget(drive=drive)
-    kept = corrected_rows(fleet)
-    assert drive not in {row[0] for row in kept}
+    rows = corrected_rows(fleet)
+    assert drive not in {row[0] for row in rows}
     other = fleet_slip.open(tmp_path / "anew")
     shutil.copytree(tmp_path / "data" / "logs", tmp_path / "anew" / "logs")
     for name in ("signals", "course"):
         other.gram(name)
-    assert corrected_rows(other) == kept
+    assert corrected_rows(other) == rows
 
 
 def test_an_erased_car_has_no_delay(late_fleet: LateFleet, tmp_path: Path) -> None:
@@ -190,15 +188,15 @@ def test_an_erased_car_has_no_delay(late_fleet: LateFleet, tmp_path: Path) -> No
     assert not course_delays(warehouse, grams, active)
 
 
-def test_what_a_course_of_unknown_delay_taught_is_not_published(
+def test_a_model_of_a_course_with_unknown_delay_is_not_published(
     late_fleet: LateFleet, tmp_path: Path
 ) -> None:
     fleet = late_fleet(tmp_path, 0.087, grams=("calibration",))
     drives = [drive for (drive,) in fleet.sql("SELECT drive_id FROM drives").fetchall()]
-    few = f"drive_id <= '{sorted(drives)[1]}'"
+    predicate = f"drive_id <= '{sorted(drives)[1]}'"
     for name in ("course", "windows"):
-        fleet.gram(name, cohort=few)
-    selection = fleet.cohort(few).select(label="course", model="steering_mean_16,ay_mean_16")
+        fleet.gram(name, cohort=predicate)
+    selection = fleet.cohort(predicate).select(label="course", model="steering_mean_16,ay_mean_16")
     with pytest.raises(RefusedError, match=r"too uncertain \(late-0000: \d\d ms, from too few"):
         fleet.models.publish("late", selection)
     assert fleet.models.publish("late", selection, force=True).new

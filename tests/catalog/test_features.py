@@ -146,13 +146,13 @@ def counts(rows: int, seed: int) -> dict[str, Any]:
 
 
 def computed_by_kernel(logged: dict[str, Any]) -> dict[str, list[float | None]]:
-    known = CATALOG.features
-    rows = CATALOG.rows(known)
+    features = CATALOG.features
+    rows = CATALOG.rows(features)
     drive = DriveCounts(np.arange(len(logged["ay"])), {name: logged[name] for name in INPUTS})
-    columns = compute_columns(ColumnPlan.from_definitions(tuple(known), rows, {}), drive)
+    columns = compute_columns(ColumnPlan.from_definitions(tuple(features), rows, {}), drive)
     return {
         name: [None if np.isnan(value) else value for value in column]
-        for name, column in zip(known, columns, strict=True)
+        for name, column in zip(features, columns, strict=True)
     }
 
 
@@ -166,13 +166,13 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
     with duckdb.connect() as database:
         database.register("log_counts", pa.table(logged))
         query = f"SELECT * FROM {with_columns('log_counts', definitions, {})}"
-        found: pa.Table = database.sql(query).to_arrow_table()
+        table: pa.Table = database.sql(query).to_arrow_table()
     by_kernel = computed_by_kernel(logged)
     for name in definitions:
-        np.testing.assert_array_equal(by_kernel[name], found[name].to_pylist(), err_msg=name)
+        np.testing.assert_array_equal(by_kernel[name], table[name].to_pylist(), err_msg=name)
     exact = {name: SIGNALS[name].exact_scale for name in INPUTS}
     clipped = 0
-    for i, row in enumerate(found.to_pylist()):
+    for i, row in enumerate(table.to_pylist()):
         physical = {name: int(logged[name][i]) * exact[name] for name in INPUTS}
         out_of_range = 0
         for name, formula in PHYSICS.items():
@@ -187,8 +187,8 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
         assert row["clipped"] == out_of_range
         clipped += out_of_range
     assert clipped > 100
-    assert found["curvature"].null_count > 50
-    assert len(found) - found["curvature"].null_count > 50
+    assert table["curvature"].null_count > 50
+    assert len(table) - table["curvature"].null_count > 50
 
 
 @pytest.mark.parametrize(
@@ -273,7 +273,7 @@ def test_a_changed_definition_never_mixes_with_the_old_rows(
         pl.col("signals").str.contains("curvature")
     )
     with_curvature = dict(rows.group_by("feature_set").agg(pl.col("n").sum()).iter_rows())
-    old, new = (with_curvature[known.identity("motion")] for known in (before, changed))
+    old, new = (with_curvature[catalog.identity("motion")] for catalog in (before, changed))
     assert 0 < new < old < 300
 
 
@@ -293,17 +293,17 @@ def test_a_drive_with_several_gram_rows_is_one_drive(warehouse: Warehouse) -> No
 
 
 def test_a_gate_that_an_odd_column_opens_makes_a_column_of_neither_kind() -> None:
-    one = CATALOG.time_columns["ay_mean_16_cornering_1"].definition
-    assert one.gate is not None
-    by_ay = one.gate.model_copy(update={"by": CATALOG.time_columns["ay_mean_32"].definition})
-    assert parity(one) == -1 and parity(one.model_copy(update={"gate": by_ay})) == 0
+    column = CATALOG.time_columns["ay_mean_16_cornering_1"].definition
+    assert column.gate is not None
+    by_ay = column.gate.model_copy(update={"by": CATALOG.time_columns["ay_mean_32"].definition})
+    assert parity(column) == -1 and parity(column.model_copy(update={"gate": by_ay})) == 0
 
 
 @pytest.mark.parametrize("name", ["windows", "course_gated", "fleet"])
-def test_what_is_odd_has_the_opposite_columns_in_a_mirrored_drive(name: str) -> None:
+def test_odd_columns_are_opposite_in_a_mirrored_drive(name: str) -> None:
     """By the kernel that Gram rows come from, every column of the set; no other one is odd."""
-    known = CATALOG
-    names = known.feature_set(name).inputs
+    catalog = CATALOG
+    names = catalog.feature_set(name).inputs
     random = np.random.default_rng(1)
     drive = {name: random.integers(4000, 6000, 400) for name in SIGNALS.inputs}
     drive |= {name: random.integers(-3000, 3000, 400) for name in drive if name in OPPOSITE}
@@ -312,33 +312,37 @@ def test_what_is_odd_has_the_opposite_columns_in_a_mirrored_drive(name: str) -> 
         for name in drive
     }
     windows = {
-        name: known.time_columns[name].definition for name in names if name in known.time_columns
+        name: catalog.time_columns[name].definition
+        for name in names
+        if name in catalog.time_columns
     }
-    plan = ColumnPlan.from_definitions(names, known.rows(names), windows)
+    plan = ColumnPlan.from_definitions(names, catalog.rows(names), windows)
 
     def columns(counts: dict[str, np.ndarray], offset: int) -> np.ndarray:
         numbers: dict[str, int] = {
             name: offset if name in OFFSETS else 500 for name in CALIBRATION_PARAMETERS
         }
-        whole = {name: values.astype(np.int16) for name, values in counts.items()}
+        counts_of_rows = {name: values.astype(np.int16) for name, values in counts.items()}
         facts = {"mass_kg": 1400.0, "vehicle_model": "suv"}
         return compute_columns(
-            plan, DriveCounts(np.arange(400), whole, numbers=numbers, facts=facts)
+            plan, DriveCounts(np.arange(400), counts_of_rows, numbers=numbers, facts=facts)
         )
 
-    found = [
-        (name, np.array_equal(one, -two, equal_nan=True))
-        for name, one, two in zip(names, columns(drive, 300), columns(other, -300), strict=True)
-        if np.nan_to_num(one).any()  # a gate that stays closed has no sign
+    odd_names = [
+        (name, np.array_equal(original, -mirrored, equal_nan=True))
+        for name, original, mirrored in zip(
+            names, columns(drive, 300), columns(other, -300), strict=True
+        )
+        if np.nan_to_num(original).any()  # a gate that stays closed has no sign
     ]
-    assert 10 < sum(is_opposite for _, is_opposite in found) < len(found)
-    assert found == [(name, known.is_odd(name)) for name, _ in found]
+    assert 10 < sum(is_opposite for _, is_opposite in odd_names) < len(odd_names)
+    assert odd_names == [(name, catalog.is_odd(name)) for name, _ in odd_names]
 
 
 def test_a_search_among_changes_knows_odd_and_short_columns_alone() -> None:
-    found = CATALOG.search_inputs("course")
-    assert "ax" not in found and "wheel_fl" not in found and "curvature" not in found
-    assert "ay_mean_128" in found and "ay_mean_256" not in found
+    inputs = CATALOG.search_inputs("course")
+    assert "ax" not in inputs and "wheel_fl" not in inputs and "curvature" not in inputs
+    assert "ay_mean_128" in inputs and "ay_mean_256" not in inputs
     assert CATALOG.search_inputs("windows") == CATALOG.feature_set("windows").inputs
 
 
@@ -390,11 +394,14 @@ def test_a_weight_changes_by_no_more_than_its_slope(edges: list[int]) -> None:
 
 
 def test_members_have_the_scale_of_their_column_and_neighbours_share_a_knot() -> None:
-    known = CATALOG
-    first, second = known.input("rear_ay_mean_16_excess_1"), known.input("rear_ay_mean_16_excess_2")
-    assert first.exact_scale == second.exact_scale == known.input("rear_ay_mean_16").exact_scale
+    catalog = CATALOG
+    first, second = (
+        catalog.input("rear_ay_mean_16_excess_1"),
+        catalog.input("rear_ay_mean_16_excess_2"),
+    )
+    assert first.exact_scale == second.exact_scale == catalog.input("rear_ay_mean_16").exact_scale
     gates = [
-        known.time_columns[f"rear_ay_mean_16_excess_{k}"].definition.gate for k in (1, 2, 3, 4)
+        catalog.time_columns[f"rear_ay_mean_16_excess_{k}"].definition.gate for k in (1, 2, 3, 4)
     ]
     assert [gate.high for gate in gates if gate][:3] == [gate.peak for gate in gates if gate][1:]
     assert gates[-1] is not None
@@ -449,27 +456,27 @@ def changes(scale: float = 1.0, slip: float = 1.0, rows: int = 2000) -> Rows:
 
 
 def related(rows: Rows, delay_s: float = 0.0) -> CourseRelation:
-    found = relate(rows @ rows.T, delay_s)
-    assert found is not None
-    return found
+    relation = relate(rows @ rows.T, delay_s)
+    assert relation is not None
+    return relation
 
 
 def test_a_car_is_found_as_it_is() -> None:
-    found = related(changes(scale=1.02))
-    assert found.scale == pytest.approx(1.02, abs=2e-3)
-    assert found.lever_m == pytest.approx(LEVER_M, abs=0.1)
-    assert found.compliance == pytest.approx(COMPLIANCE, abs=3e-4)
-    assert found.noise_mps == pytest.approx(NOISE_MPS, rel=0.1)
-    assert found.fault is None and found.misplaced is None
+    relation = related(changes(scale=1.02))
+    assert relation.scale == pytest.approx(1.02, abs=2e-3)
+    assert relation.lever_m == pytest.approx(LEVER_M, abs=0.1)
+    assert relation.compliance == pytest.approx(COMPLIANCE, abs=3e-4)
+    assert relation.noise_mps == pytest.approx(NOISE_MPS, rel=0.1)
+    assert relation.fault is None and relation.misplaced is None
 
 
 @pytest.mark.parametrize("shift", [-1.5, 1.6])
 def test_another_place_has_another_lever(shift: float) -> None:
     rows = changes()
     rows[5] += shift * rows[1]
-    found = related(rows)
-    assert found.fault is None and found.misplaced is not None
-    assert "antenna" in found.misplaced.remedy
+    relation = related(rows)
+    assert relation.fault is None and relation.misplaced is not None
+    assert "antenna" in relation.misplaced.remedy
 
 
 def test_a_delay_that_is_known_is_no_other_place() -> None:
@@ -490,7 +497,7 @@ def test_a_delay_that_is_known_is_no_other_place() -> None:
         (lambda _: changes(slip=0.0)[5], "no slip"),
     ],
 )
-def test_what_is_no_course_is_named(spoil: Callable[[Rows], Rows], kind: str) -> None:
+def test_a_column_that_is_no_course_is_named(spoil: Callable[[Rows], Rows], kind: str) -> None:
     rows = changes()
     rows[5] = spoil(rows)
     fault = related(rows).fault
@@ -498,8 +505,8 @@ def test_what_is_no_course_is_named(spoil: Callable[[Rows], Rows], kind: str) ->
 
 
 def test_little_driving_tells_nothing() -> None:
-    few = changes(rows=90)
-    assert relate(few @ few.T) is None
+    short_drive = changes(rows=90)
+    assert relate(short_drive @ short_drive.T) is None
     straight = changes()
     straight[4] *= 1e-3
     assert relate(straight @ straight.T) is None

@@ -85,7 +85,7 @@ def reordered(text: str) -> str:
     """Return a catalog with its signals, and its drive columns, in reverse order."""
     comment, *tables = re.split(r"(?m)^(?=\[)", text)
     kinds = ("[signals.", "[drive.")
-    tables = [one if one.endswith("\n") else one + "\n" for one in tables]
+    tables = [table if table.endswith("\n") else table + "\n" for table in tables]
     sorted_out = [[t for t in tables if t.startswith(kind)] for kind in kinds]
     assert sum(map(len, sorted_out)) == len(tables)
     return comment + "".join(t for group in sorted_out for t in reversed(group))
@@ -113,7 +113,7 @@ def test_an_order_of_signals_is_no_damage(
 def test_models_and_rewritten_files_do_not_depend_on_the_order(
     run_command: RunCommand, other: dict[str, str], smoke_copy: Path
 ) -> None:
-    chosen = [run_command("select", "--json", **given).json for given in ({}, {"env": other})]
+    chosen = [run_command("select", "--json", **options).json for options in ({}, {"env": other})]
     assert chosen[0]["models"] == chosen[1]["models"]
     assert run_command("compact", env=other).exit_code == 0
     for environment in ({}, {"env": other}):

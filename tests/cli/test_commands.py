@@ -81,9 +81,9 @@ def test_a_nightly_run_reads_the_new_day_only_and_ends_where_one_run_ends(
     assert second["gram"]["rows_read"] == second["simulate"]["rows"] > 0
     assert first["publish"] == {**first["publish"], "model": "smoke", "version": 1, "new": True}
     assert (second["publish"]["version"], second["changed"]) == (2, True)
-    asked = ("select", "--cohort", "campaign = 'smoke'", "--models", "table1", "--json")
-    at_once = run_command(*asked, root=smoke_root)
-    by_night = run_command(*asked)
+    command = ("select", "--cohort", "campaign = 'smoke'", "--models", "table1", "--json")
+    at_once = run_command(*command, root=smoke_root)
+    by_night = run_command(*command)
     assert by_night.json == at_once.json
 
 
@@ -104,8 +104,8 @@ def test_select_reports_the_models_in_the_list_s_order(
         (("--tolerance", "0.000001deg"), "5"),
         (("--tolerance", "1deg"), "1"),
     ):
-        asked = run_command(*listed, *worth, root=smoke_root).json
-        assert asked["winner"] == winner
+        selection = run_command(*listed, *worth, root=smoke_root).json
+        assert selection["winner"] == winner
     table = run_command("select", "--order", "ay,yaw_rate,steering_wheel", root=smoke_root).stdout
     assert "first 3" in table
     assert "winner: " in table
@@ -154,8 +154,11 @@ def test_publish_show_score_promote_and_roll_back(
     run_command: RunCommand, smoke_copy: Path, tmp_path: Path
 ) -> None:
     same = ("publish", "slip", "--models", "table1", "--cohort", "campaign = 'smoke'", "--json")
-    made = [run_command(*same).json for _ in range(2)]
-    assert [(one["version"], one["new"]) for one in made] == [(1, True), (1, False)]
+    publications = [run_command(*same).json for _ in range(2)]
+    assert [(publication["version"], publication["new"]) for publication in publications] == [
+        (1, True),
+        (1, False),
+    ]
     alone = ("--models", write_list(tmp_path / "ax.toml", "ax"))
     worse = run_command("publish", "slip", *alone)
     assert worse.exit_code == 7
@@ -259,11 +262,11 @@ def test_a_long_condition_is_not_printed_whole_unless_all_is(
     run_command: RunCommand, smoke_root: Path
 ) -> None:
     predicate = "drive_id NOT IN (" + ", ".join(f"'car-{i:03}'" for i in range(50)) + ")"
-    asked = ("select", "--cohort", predicate, "--models", "table1")
-    short = run_command(*asked, root=smoke_root).stdout
+    command = ("select", "--cohort", predicate, "--models", "table1")
+    short = run_command(*command, root=smoke_root).stdout
     assert predicate[:60] in short
     assert "… (--all); " in short
-    assert predicate in run_command(*asked, "--all", root=smoke_root).stdout
+    assert predicate in run_command(*command, "--all", root=smoke_root).stdout
 
 
 def test_a_changed_campaign_is_refused_and_changes_nothing(
@@ -273,12 +276,12 @@ def test_a_changed_campaign_is_refused_and_changes_nothing(
     text = SHIPPED_CONFIGS.find("campaigns", "smoke").read_text()
     seed = next(line for line in text.splitlines() if line.startswith("seed"))
     (tmp_path / "mine.toml").write_text(text.replace(seed, "seed = 999"))
-    asked = ("sql", "SELECT count(*) AS n FROM log", "--json")
-    before = run_command(*asked, root=root_to_fail_in).json
+    query = ("sql", "SELECT count(*) AS n FROM log", "--json")
+    before = run_command(*query, root=root_to_fail_in).json
     changed = run_command("simulate", "./mine.toml", root=root_to_fail_in)
     assert changed.exit_code == 7
     assert "has changed since this day was simulated" in changed.stderr
-    assert run_command(*asked, root=root_to_fail_in).json == before
+    assert run_command(*query, root=root_to_fail_in).json == before
 
 
 def test_the_version_is_told(run_command: RunCommand) -> None:
@@ -339,15 +342,17 @@ CAR = "mass_kg = 1480\nfront_axle_m = 1.11\nrear_axle_m = 1.67\nrolling_radius_m
 def test_a_car_is_identified_and_its_file_is_a_vehicle(smoke_root: Path, tmp_path: Path) -> None:
     measures, file = tmp_path / "measures.toml", tmp_path / "mine.toml"
     measures.write_text(CAR)
-    some = ("--vehicle", str(measures), "--cohort", "drive_id < 'smoke-2024-05-01-0002'")
-    done = run_on(smoke_root, "identify", "mine", *some, "--output", str(file), "--json")
+    options = ("--vehicle", str(measures), "--cohort", "drive_id < 'smoke-2024-05-01-0002'")
+    done = run_on(smoke_root, "identify", "mine", *options, "--output", str(file), "--json")
     assert done.exit_code == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert (found["name"], found["drives"]) == ("mine", 2)
-    assert 0.028 < found["fit_deg"] < found["held_out_deg"] < 0.06, "the label's noise is 0.029"
+    document = json.loads(done.stdout)
+    assert (document["name"], document["drives"]) == ("mine", 2)
+    assert 0.028 < document["fit_deg"] < document["held_out_deg"] < 0.06, (
+        "the label's noise is 0.029"
+    )
     car = load_vehicle(str(file), SHIPPED_CONFIGS)
     assert car.body.mass_kg == pytest.approx(1480)
-    assert car.body.yaw_inertia_kgm2 == pytest.approx(found["found"]["yaw_inertia_kgm2"])
+    assert car.body.yaw_inertia_kgm2 == pytest.approx(document["found"]["yaw_inertia_kgm2"])
 
 
 def test_a_car_without_labelled_drives_cannot_be_identified(smoke_root: Path) -> None:
@@ -375,7 +380,7 @@ def test_measures_that_no_car_has_are_refused(
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
+def help_words(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """A folder in which the program has run for the first time, and the lines after `next:`."""
     folder = tmp_path_factory.mktemp("first")
     done = run_here([COMMAND, "run", "--campaign", "smoke", "--models", "table1"], folder)
@@ -384,8 +389,8 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     return folder, lines.splitlines()
 
 
-def test_each_command_can_be_typed(told: tuple[Path, list[str]]) -> None:
-    folder, lines = told
+def test_each_command_can_be_typed(help_words: tuple[Path, list[str]]) -> None:
+    folder, lines = help_words
     commands = [shlex.split(line)[3] for line in lines]
     assert commands == ["sql", "show", "select", "evaluate", "report"]
     for line in lines[:3]:

@@ -25,7 +25,7 @@ windows = ["steer_fl_mean", "ay_mean_16"]
 
 
 @pytest.fixture
-def own(tmp_path: Path) -> Path:
+def config_folder(tmp_path: Path) -> Path:
     folder = tmp_path / "own"
     (folder / "models").mkdir(parents=True)
     (folder / "features.toml").write_text(OWN, encoding="utf-8")
@@ -38,28 +38,28 @@ def own(tmp_path: Path) -> Path:
 
 
 def test_own_features_and_lists_are_used_without_touching_the_package(
-    run_command: RunCommand, own: Path, smoke_copy: Path
+    run_command: RunCommand, config_folder: Path, smoke_copy: Path
 ) -> None:
-    own_first = ("--config", str(own))
+    own_first = ("--config", str(config_folder))
     missing = run_command(*own_first, "select", "--models", "few")
     assert missing.exit_code == 5
     assert "fleet-slip gram --features mine" in missing.stderr
     done = run_command(*own_first, "gram", "--features", "mine")
     assert done.exit_code == 0, done.stderr
-    found = run_command(*own_first, "select", "--models", "few", "--json").json
-    assert found["models"][0]["signals"] == ["ay", "steer_fl_mean_50"]
+    selection = run_command(*own_first, "select", "--models", "few", "--json").json
+    assert selection["models"][0]["signals"] == ["ay", "steer_fl_mean_50"]
     assert run_command("select", "--models", "few").exit_code == 3
     published = run_command(*own_first, "publish", "mine", "--models", "few")
     assert published.exit_code == 0, published.stderr
     # The manifest defines its columns itself: the folder is no longer needed.
     scored = run_command("score", "mine", "--json").json
-    assert scored["rows"] == found["rows"]
-    assert abs(scored["rmse_deg"] / found["models"][0]["rmse_deg"] - 1) < 0.2
+    assert scored["rows"] == selection["rows"]
+    assert abs(scored["rmse_deg"] / selection["models"][0]["rmse_deg"] - 1) < 0.2
     by_environment = run_command(
-        "features", "--files", "--json", env={**os.environ, "FLEET_SLIP_CONFIG": str(own)}
+        "features", "--files", "--json", env={**os.environ, "FLEET_SLIP_CONFIG": str(config_folder)}
     )
     assert by_environment.exit_code == 0
-    files = {name: one["from"] for name, one in by_environment.json.items()}
+    files = {name: entry["from"] for name, entry in by_environment.json.items()}
     assert files["features.toml"] == files["models/few.toml"] == "own"
     assert files["signals.toml"] == "shipped"
 
@@ -76,7 +76,7 @@ def test_own_features_and_lists_are_used_without_touching_the_package(
         ("features.toml", OWN.replace('"ay_mean_16"', '"ay_mean_17"'), "unknown ay_mean_17"),
     ],
 )
-def test_what_is_no_config_is_said_and_changes_nothing(
+def test_an_invalid_config_is_reported_and_changes_nothing(
     run_command: RunCommand, tmp_path: Path, name: str, text: str, message: str
 ) -> None:
     file = tmp_path / "own" / name
@@ -92,7 +92,7 @@ def test_the_query_of_a_column_runs_as_it_is_printed(
 ) -> None:
     for name in ("ay_bias", "ay_mean_16_mass", "ay_excess"):
         query = run_command("features", "--sql", name).stdout
-        asked = ("sql", f"SELECT count({name}) AS n FROM ({query})", "--json")
-        rows = run_command(*asked, root=smoke_root).json
+        command = ("sql", f"SELECT count({name}) AS n FROM ({query})", "--json")
+        rows = run_command(*command, root=smoke_root).json
         assert rows[0]["n"] > 1000, name
     assert run_command("features", "--sql", "mood").exit_code == 5

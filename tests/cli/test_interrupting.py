@@ -27,7 +27,7 @@ from tests.support.measured import MAPPING_TEXT, csv_text, good_columns
 
 
 @pytest.fixture
-def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def messages(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Remarks, as they come."""
     remarks: list[str] = []
     monkeypatch.setattr(LOGGER, "log", lambda _level, text, **_: remarks.append(text))
@@ -35,14 +35,14 @@ def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_the_command_ends_with_130_and_may_be_given_again(
-    monkeypatch: pytest.MonkeyPatch, said: list[str]
+    monkeypatch: pytest.MonkeyPatch, messages: list[str]
 ) -> None:
     def interrupted() -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(program, "app", interrupted)
     assert program._exit_code_of_app() == 130
-    (remark,) = said
+    (remark,) = messages
     assert remark.endswith("Repeat the command to continue.")
 
 
@@ -71,7 +71,7 @@ def test_an_interrupt_while_modules_are_imported_is_one_line(module: str, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "is_reported"),
     [
         (MemoryError(), True),
         (ImportError("x.so: failed to map segment from shared object"), True),
@@ -82,15 +82,15 @@ def test_an_interrupt_while_modules_are_imported_is_one_line(module: str, tmp_pa
     ],
 )
 def test_a_want_of_memory_is_told_with_an_amount_and_a_bug_is_not_hidden(
-    error: Exception, told: bool, monkeypatch: pytest.MonkeyPatch, said: list[str]
+    error: Exception, is_reported: bool, monkeypatch: pytest.MonkeyPatch, messages: list[str]
 ) -> None:
     def fail() -> None:
         raise error
 
     monkeypatch.setattr(program, "app", fail)
-    if told:
+    if is_reported:
         assert program._exit_code_of_app() == 6
-        assert re.search(r"out of memory: the limit of this process is [\d,]+ MiB", said[0])
+        assert re.search(r"out of memory: the limit of this process is [\d,]+ MiB", messages[0])
     else:
         with pytest.raises(type(error)):
             program._exit_code_of_app()
@@ -190,14 +190,14 @@ def test_a_command_does_not_wait_for_what_it_does_not_need(
         ([*at, "select", "--help"], {"highway_env", "matplotlib"}),
         (["--root", "data", "ingest", *files], {"highway_env", "matplotlib"}),
     ]
-    asked = json.dumps([words for words, _ in spared_by])
-    done = run([sys.executable, "-c", PROGRAM, asked], cwd=tmp_path)
+    commands = json.dumps([words for words, _ in spared_by])
+    done = run([sys.executable, "-c", PROGRAM, commands], cwd=tmp_path)
     assert done.exit_code == 0, done.stderr
-    told = [line for line in done.stderr.splitlines() if line.startswith("[")]
-    for (words, spared), modules in zip(spared_by, map(json.loads, told), strict=True):
+    lines = [line for line in done.stderr.splitlines() if line.startswith("[")]
+    for (words, spared), modules in zip(spared_by, map(json.loads, lines), strict=True):
         assert "fleet_slip.cli.main" in modules
         assert not spared.union(["pandas"]).intersection(modules), words
-    assert "polars" in json.loads(told[-1])
+    assert "polars" in json.loads(lines[-1])
 
 
 def test_every_command_is_listed_in_its_own_words() -> None:
@@ -214,11 +214,11 @@ def test_every_command_is_listed_in_its_own_words() -> None:
 def test_the_help_of_a_command_has_an_example_that_can_be_typed(name: str) -> None:
     command = load_command(name)
     examples = re.findall(r": (fleet-slip [^:]+?)(?:\n\n|, then|$)", command.help or "")
-    own = [words for words in map(shlex.split, examples) if name in words]
-    assert own, examples
-    for words in own:
-        given = words[words.index(name) + 1 :]
-        command.make_context(name, given).close()  # raises for what it does not know
+    own_examples = [words for words in map(shlex.split, examples) if name in words]
+    assert own_examples, examples
+    for words in own_examples:
+        arguments = words[words.index(name) + 1 :]
+        command.make_context(name, arguments).close()  # raises for what it does not know
 
 
 def test_help_groups_the_commands_and_begins_with_nine() -> None:
@@ -266,11 +266,11 @@ def test_a_short_command_imports_no_large_library_in_vain(
 def test_select_and_publish_take_the_options_of_the_api() -> None:
     """Their help names every ranking, criterion and method."""
     options = {field.name for field in fields(SelectionRequest)}
-    taken = {name: {one.name for one in load_command(name).params} for name in COMMANDS}
+    taken = {name: {parameter.name for parameter in load_command(name).params} for name in COMMANDS}
     assert taken["select"] - {"json", "cohort", "everything", "include_faulty", "save"} == options
     assert taken["publish"] & options == {"models", "label", "robust", "half_life", "prior"}
     assert len(taken["publish"] - {"name", "help", "context"}) <= 12
-    helps = {one.name: one.help for one in load_command("select").params}
+    helps = {parameter.name: parameter.help for parameter in load_command("select").params}
     for option, names in (("ranking", RANKINGS), ("criterion", CRITERIA), ("search", METHODS)):
         assert all(re.search(rf"\b{name}\b", helps[option]) for name in names)
 

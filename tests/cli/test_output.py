@@ -1,4 +1,4 @@
-"""What a terminal shows of answers, and where those to queries go: a table, or a file."""
+"""Output on a terminal, and of queries: a table or a file."""
 
 import contextlib
 import csv
@@ -27,8 +27,8 @@ def test_a_table_has_numbers_that_people_read_and_json_those_that_are_there(
     table = run_command("sql", QUERY, root=smoke_root).stdout
     assert "52.66 " in table
     assert "52.6600" not in table
-    told = run_command("sql", f"{QUERY} LIMIT 3", "--json", root=smoke_root).json
-    assert [row["exact"] for row in told] == [52.660000000000004] * 3
+    document = run_command("sql", f"{QUERY} LIMIT 3", "--json", root=smoke_root).json
+    assert [row["exact"] for row in document] == [52.660000000000004] * 3
     odd = run_command("sql", "SELECT 'nan'::DOUBLE a, NULL::DOUBLE b, 1e300 c", root=smoke_root)
     assert {"nan", "NULL", "1e+300"} <= set(odd.stdout.replace("│", " ").split())
 
@@ -38,9 +38,9 @@ def test_a_table_can_be_asked_for_whole(run_command: RunCommand, smoke_root: Pat
     short = run_command("sql", query, root=smoke_root)
     assert "output truncated" in short.stderr
     cut = short.stdout
-    whole = run_command("sql", query, "--all", root=smoke_root).stdout
+    output = run_command("sql", query, "--all", root=smoke_root).stdout
     assert "x" * 300 not in cut
-    assert whole.count("x" * 300) == 100
+    assert output.count("x" * 300) == 100
 
 
 @pytest.mark.parametrize("suffix", ["parquet", "csv", "json"])
@@ -62,7 +62,7 @@ def test_an_answer_becomes_a_file(
     assert rows[0]["exact"] == 52.660000000000004
 
 
-def test_where_nothing_can_be_written_is_said(
+def test_an_unwritable_output_is_reported(
     run_command: RunCommand, smoke_root: Path, tmp_path: Path
 ) -> None:
     other = run_command("sql", QUERY, "--output", "drives.xlsx", root=smoke_root)
@@ -218,7 +218,7 @@ def test_a_pipe_is_sent_texts_as_they_are(
 
 
 @pytest.mark.parametrize("command", ["select", "show smoke"])
-def test_what_a_newcomer_asks_first_is_a_screen_of_80_columns(
+def test_first_commands_fit_a_screen_of_80_columns(
     smoke_root: Path, shown: Shown, command: str
 ) -> None:
     def give() -> None:
@@ -227,11 +227,11 @@ def test_what_a_newcomer_asks_first_is_a_screen_of_80_columns(
     lines = shown(give, 80)
     assert max(map(len, lines)) <= 80
     assert len(lines) < 50
-    whole = shown(
+    full = shown(
         lambda: app(["--root", str(smoke_root), *command.split(), "--all"], standalone_mode=False),
         200,
     )
-    assert sum(map(len, whole)) > sum(map(len, lines))
+    assert sum(map(len, full)) > sum(map(len, lines))
 
 
 def test_the_winner_stands_first(smoke_root: Path, shown: Shown) -> None:

@@ -79,10 +79,10 @@ def test_a_published_model_with_features_explains_and_evaluates_them(
 ) -> None:
     nested = ("--order", "ay,steer_fl,curvature,speed_squared")
     arguments = ("--features", "motion", *nested, "--ranking", "declared", "--criterion", "aic")
-    own = str(own_set.with_name("curved.toml"))
-    done = run_command("select", *arguments, "--save", own, "--json", root=own_set)
+    list_path = str(own_set.with_name("curved.toml"))
+    done = run_command("select", *arguments, "--save", list_path, "--json", root=own_set)
     assert done.exit_code == 0, done.stderr
-    published = ("publish", "curved", "--models", own, "--json")
+    published = ("publish", "curved", "--models", list_path, "--json")
     assert run_command(*published, root=own_set).json["new"]
     shown = run_command("show", "curved", "--json", root=own_set).json
     terms = {term["signal"]: term for term in shown["terms"]}
@@ -132,8 +132,8 @@ def test_a_number_of_folds_that_cannot_be_is_named(
     (tmp_path / "data").mkdir()
     done = run_command(*words.split())
     assert done.exit_code == 2
-    asked = words.partition("--folds ")[2].partition(" ")[0]
-    assert f"error: folds = {asked}: choose a number from 2 to 1000" in done.stderr
+    number = words.partition("--folds ")[2].partition(" ")[0]
+    assert f"error: folds = {number}: choose a number from 2 to 1000" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -145,10 +145,10 @@ def test_as_many_folds_as_drives_leave_out_each(
 ) -> None:
     """Hashed, some folds would have two drives and others none."""
     five = ("select", "--cohort", "drive_id < 'smoke-2024-05-02-0001'", *extra, "--json")
-    found = run_command(*five, "--folds", "5", root=more_sets).json
-    assert (found["drives"], found["folds"]["count"]) == (5, 5)
-    each = run_command(*five, "--folds", "each", root=more_sets).json
-    assert found["models"] == each["models"]
+    by_number = run_command(*five, "--folds", "5", root=more_sets).json
+    assert (by_number["drives"], by_number["folds"]["count"]) == (5, 5)
+    by_name = run_command(*five, "--folds", "each", root=more_sets).json
+    assert by_number["models"] == by_name["models"]
     many = run_command("select", "--folds", "1000", *extra, "--json", root=more_sets).json
     assert many["folds"]["count"] == many["drives"] == 8
     fewer = run_command(*five, "--folds", "3", root=more_sets).json
@@ -156,10 +156,10 @@ def test_as_many_folds_as_drives_leave_out_each(
 
 
 def test_one_model_is_taken_without_a_list(run_command: RunCommand, more_sets: Path) -> None:
-    given = run_command("select", "--model", "ax, ay,yaw_rate", "--json", root=more_sets).json
+    selection = run_command("select", "--model", "ax, ay,yaw_rate", "--json", root=more_sets).json
     listed = run_command("select", "--models", "table1", "--json", root=more_sets).json
-    (model,) = given["models"]
-    assert model["name"] == given["winner"] == "given"
+    (model,) = selection["models"]
+    assert model["name"] == selection["winner"] == "given"
     assert model["coefficients"] == listed["models"][0]["coefficients"]
 
 
@@ -184,20 +184,20 @@ def test_a_model_through_the_origin_is_published_as_one(
     root = own_set
     chosen = ("--model", "ay,yaw_rate,steering_wheel")
     usual = run_command("select", *chosen, "--json", root=root).json
-    own = str(tmp_path / "origin.toml")
-    origin = ("--no-intercept", "--save", own, "--json")
+    list_path = str(tmp_path / "origin.toml")
+    origin = ("--no-intercept", "--save", list_path, "--json")
     selected = run_command("select", *chosen, *origin, root=root).json
     assert (usual["intercept"], selected["intercept"]) == (True, False)
     assert usual["models"][0]["intercept"] != 0 == selected["models"][0]["intercept"]
-    run_command("publish", "straight", "--models", own, root=root)
+    run_command("publish", "straight", "--models", list_path, root=root)
     shown = run_command("show", "straight", "--json", root=root).json
     assert shown["through_origin"] is True
     assert shown["intercept"] == 0
-    coefficients = {one["signal"]: one["coefficient"] for one in shown["terms"]}
+    coefficients = {item["signal"]: item["coefficient"] for item in shown["terms"]}
     assert coefficients == selected["models"][0]["coefficients"]
     assert "through the origin" in run_command("show", "straight", root=root).stdout
     by_rows = run_command("diagnose", "straight", "--json", root=root).json["by_rows"]
-    assert {one["name"]: one["value"] for one in by_rows} == coefficients
+    assert {item["name"]: item["value"] for item in by_rows} == coefficients
     run_command("export", "straight", "--to", "json", "--output", str(tmp_path), root=root)
     exported = json.loads((tmp_path / "straight-1.json").read_text())
     assert exported["model"]["manifest"]["through_origin"] is True
@@ -205,8 +205,8 @@ def test_a_model_through_the_origin_is_published_as_one(
     scored = run_command("score", "straight", "--json", root=root).json
     with fleet_slip.connect(root, query="log") as database:
         terms = " + ".join(
-            f"{value!r} * {one}"
-            for one, value in zip(
+            f"{value!r} * {item}"
+            for item, value in zip(
                 ("ay_mps2", "yaw_rate_rad_s", "steering_wheel_rad"),
                 coefficients.values(),
                 strict=True,
@@ -224,8 +224,8 @@ def test_a_set_is_not_asked_of_drives_that_no_gram_row_names(
     ignored = shutil.ignore_patterns("grams")
     root = shutil.copytree(smoke_root, tmp_path / "data", ignore=ignored)
     assert run_command("gram", "--features", "motion", root=root).exit_code == 0
-    asked = ("select", "--features", "windows", "--order", "ax,ay", "--cohort")
-    refused = run_command(*asked, "campaign = 'smoke'", root=root)
+    command = ("select", "--features", "windows", "--order", "ax,ay", "--cohort")
+    refused = run_command(*command, "campaign = 'smoke'", root=root)
     assert refused.exit_code == 5
     assert "features are missing for 4 log files. Run: fleet-slip gram &&" in refused.stderr
     assert "no drive matches" not in refused.stderr
@@ -234,31 +234,31 @@ def test_a_set_is_not_asked_of_drives_that_no_gram_row_names(
 def test_single_drives_have_errors_by_rows_with_a_warning(
     run_command: RunCommand, smoke_root: Path
 ) -> None:
-    asked = ("diagnose", "--signals", "ay,steer_fl", "--cohort", "drive_id LIKE '%05-01-0000'")
-    done = run_command(*asked, root=smoke_root)
+    command = ("diagnose", "--signals", "ay,steer_fl", "--cohort", "drive_id LIKE '%05-01-0000'")
+    done = run_command(*command, root=smoke_root)
     assert done.exit_code == 0
     assert "only one drive" in done.stderr
-    found = run_command(*asked, "--json", root=smoke_root).json
-    assert (found["cluster"], found["clusters"]) == ("row", 1)
-    assert found["by_clusters"] == found["by_rows"]
+    diagnosis = run_command(*command, "--json", root=smoke_root).json
+    assert (diagnosis["cluster"], diagnosis["clusters"]) == ("row", 1)
+    assert diagnosis["by_clusters"] == diagnosis["by_rows"]
 
 
 def test_rows_that_tell_nothing_are_told(
     run_command: RunCommand, warehouse: Warehouse, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(7)
-    known = [counts(drive(rng, gentleness=2)) for _ in range(30)]
-    for one in known[24:]:
-        del one["sideslip"]
-    land(warehouse, "all", *(log_rows(f"d{i}", one) for i, one in enumerate(known)))
+    drives = [counts(drive(rng, gentleness=2)) for _ in range(30)]
+    for signals in drives[24:]:
+        del signals["sideslip"]
+    land(warehouse, "all", *(log_rows(f"d{i}", signals) for i, signals in enumerate(drives)))
     update_grams(warehouse)
-    asked = ("--order", "ay,yaw_rate")
-    told = f"{6 * TICKS:,} of {30 * TICKS:,} rows skipped"
-    chosen = run_command("select", *asked)
-    assert told in chosen.stderr, chosen.stderr
-    assert run_command("select", *asked, "--json").json["rows_without"] == 6 * TICKS
-    own = write_list(tmp_path / "own.toml", "ay,yaw_rate")
-    assert run_command("publish", "beta", "--models", own, "--force").exit_code == 0
+    options = ("--order", "ay,yaw_rate")
+    message = f"{6 * TICKS:,} of {30 * TICKS:,} rows skipped"
+    chosen = run_command("select", *options)
+    assert message in chosen.stderr, chosen.stderr
+    assert run_command("select", *options, "--json").json["rows_without"] == 6 * TICKS
+    list_path = write_list(tmp_path / "own.toml", "ay,yaw_rate")
+    assert run_command("publish", "beta", "--models", list_path, "--force").exit_code == 0
     cohort = ("--cohort", "true")
-    assert told in run_command("score", "beta", *cohort).stderr
+    assert message in run_command("score", "beta", *cohort).stderr
     assert run_command("score", "beta", *cohort, "--json").json["rows_without"] == 6 * TICKS

@@ -1,4 +1,4 @@
-"""What the filters are tuned to, sought once: that takes more than all else in an evaluation."""
+"""Tuned parameters of the filters, found once: tuning takes most of the time of an evaluation."""
 
 import shutil
 from collections.abc import Iterator

@@ -82,13 +82,13 @@ def _allow_all_data() -> None:
 
 
 def run_compiled(
-    words: Sequence[str | Path], folder: Path | None = None, given: bytes = b""
+    words: Sequence[str | Path], folder: Path | None = None, data: bytes = b""
 ) -> bytes:
     """Run a compiled program; return what it says."""
     done = subprocess.run(
         words,
         cwd=folder,
-        input=given,
+        input=data,
         capture_output=True,
         check=False,
         timeout=300,
@@ -100,7 +100,7 @@ def run_compiled(
 
 @cache
 def can_sanitize() -> bool:
-    """Whether the compiler has the sanitizers, and a program with them runs here."""
+    """Return True if the compiler has the sanitizers, and a program with them runs here."""
     with TemporaryDirectory() as folder:
         Path(folder, "empty.c").write_text("int main(void) { return 0; }\n")
         try:
@@ -130,13 +130,15 @@ def build_driver(
 
 def drive(driver: Path, program: Program, car: Car, samples: Sequence[Sample]) -> list[int | None]:
     """Return the angles that a driver writes."""
-    known = [*car.fact_counts(program), *car.number_counts(program)]
-    given = struct.pack(f"{len(known)}i", *(NO_ANGLE if one is None else one for one in known))
+    constants = [*car.fact_counts(program), *car.number_counts(program)]
+    message = struct.pack(
+        f"{len(constants)}i", *(NO_ANGLE if count is None else count for count in constants)
+    )
     width = len(field_names(program)["signals"])
-    counts = [-(2**15) if one is None else one for sample in samples for one in sample]
-    given += struct.pack(f"{width * len(samples)}h", *counts)
-    angles = struct.unpack(f"{len(samples)}i", run_compiled([driver], given=given))
-    return [None if one == NO_ANGLE else one for one in angles]
+    counts = [-(2**15) if count is None else count for sample in samples for count in sample]
+    message += struct.pack(f"{width * len(samples)}h", *counts)
+    angles = struct.unpack(f"{len(samples)}i", run_compiled([driver], data=message))
+    return [None if count == NO_ANGLE else count for count in angles]
 
 
 MISSING = -(2**31)
@@ -199,16 +201,18 @@ def learned(
         )
         for name in columns
     )
-    one = model_of(MODELS["signals"], name="any")
-    trained = one.trained_on.model_copy(update={"feature_set": catalog.identity(feature_set)})
-    said = LearnedFrom(
+    manifest = model_of(MODELS["signals"], name="any")
+    trained = manifest.trained_on.model_copy(update={"feature_set": catalog.identity(feature_set)})
+    source = LearnedFrom(
         label="course",
         change_s=4.0,
         cars=1,
         intercept_uncertainty_deg=0.01,
         intercept_spread_deg=0.0,
     )
-    return one.model_copy(update={"terms": terms, "trained_on": trained, "learned_from": said})
+    return manifest.model_copy(
+        update={"terms": terms, "trained_on": trained, "learned_from": source}
+    )
 
 
 @dataclass
@@ -220,10 +224,10 @@ class Counter:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        return tuple(one.name for one in lower(CATALOG, self.sets)[0].signals)
+        return tuple(signal.name for signal in lower(CATALOG, self.sets)[0].signals)
 
     def messages(self, table: pa.Table, late: int = 0, start_s: int = START_S) -> bytes:
-        """What a car sends of a drive whose log is that table."""
+        """Return the messages that a car sends for a drive with these rows."""
         ticks = table["tick"].to_numpy()
         samples = np.full((ticks[-1] + 1, 1 + len(self.signals)), MISSING, np.int32)
         samples[:, 0] = 0
@@ -232,8 +236,8 @@ class Counter:
             samples[ticks, 1 + place] = table[name].cast(pa.int32()).fill_null(MISSING).to_numpy()
         car = table["vehicle_id"][0].as_py()
         head = struct.pack("<16sQqQ", car.encode(), start_s, late, len(samples))
-        given = head + samples.tobytes()
-        return run_compiled([self.program], given=given)
+        content = head + samples.tobytes()
+        return run_compiled([self.program], data=content)
 
 
 def write_counter(folder: Path, sets: tuple[OnBoard, ...]) -> None:

@@ -28,31 +28,31 @@ def run_drives(
     session: onnxruntime.InferenceSession, program: Program, cars: Sequence[Car], drives: Any
 ) -> Any:
     """Drive cars side by side, shape (cars, ticks, signals) with NaN; return (cars, ticks)."""
-    told = {
+    facts = {
         "facts": [car.fact_counts(program) for car in cars],
         "numbers": [car.number_counts(program) for car in cars],
     }
-    given: dict[str, Any] = {}
-    for one in session.get_inputs():
-        if one.name in told:
-            values = [[UNKNOWN if n is None else n for n in row] for row in told[one.name]]
-            given[one.name] = np.array(values, np.int64)
-        elif one.name != "signals":
-            empty = UNKNOWN if one.name.startswith("ring") else 0
-            given[one.name] = np.full((len(cars), one.shape[1]), empty, np.int64)
-    names = [one.name for one in session.get_outputs()]
+    feeds: dict[str, Any] = {}
+    for node in session.get_inputs():
+        if node.name in facts:
+            values = [[UNKNOWN if n is None else n for n in row] for row in facts[node.name]]
+            feeds[node.name] = np.array(values, np.int64)
+        elif node.name != "signals":
+            empty = UNKNOWN if node.name.startswith("ring") else 0
+            feeds[node.name] = np.full((len(cars), node.shape[1]), empty, np.int64)
+    names = [node.name for node in session.get_outputs()]
     angles = []
     for tick in range(drives.shape[1]):
-        computed = session.run(None, {**given, "signals": drives[:, tick]})
-        found = dict(zip(names, computed, strict=True))
-        angles.append(found.pop("angle")[:, 0])
-        given |= {name.removesuffix("_next"): value for name, value in found.items()}
+        computed = session.run(None, {**feeds, "signals": drives[:, tick]})
+        outputs = dict(zip(names, computed, strict=True))
+        angles.append(outputs.pop("angle")[:, 0])
+        feeds |= {name.removesuffix("_next"): value for name, value in outputs.items()}
     return np.array(angles).T
 
 
 def in_si(program: Program, samples: Sequence[Sample], dtype: str) -> Any:
     counts = np.array([[np.nan if n is None else n for n in row] for row in samples], float)
-    return (counts * [float(one.scale) for one in program.signals]).astype(dtype)
+    return (counts * [float(signal.scale) for signal in program.signals]).astype(dtype)
 
 
 def by_duckdb(statement: str, log: pl.DataFrame) -> dict[tuple[str, int], int | None]:

@@ -101,8 +101,15 @@ LINE = Definition(
 SPEED_NOW = Definition(of="wheel_fl", bits=16)
 PACE = Definition(of="pace", made=Product(of=(SPEED_NOW, LINE), ratio=Fraction(1, 1000)))
 CHANGES = tuple(
-    Definition(of=one.of, made=one.made, of_bits=one.of_bits, over="change", ticks=ticks, bits=16)
-    for one in (PACE, LINE)
+    Definition(
+        of=first_stage.of,
+        made=first_stage.made,
+        of_bits=first_stage.of_bits,
+        over="change",
+        ticks=ticks,
+        bits=16,
+    )
+    for first_stage in (PACE, LINE)
     for ticks in (2, 5)
 )
 SLOPE = Definition(
@@ -125,14 +132,14 @@ LEARNING = {
         of="one", made=Product(of=(), ratio=Fraction(9)), gate=Gate(by=SLOPE, low=-99, peak=-9)
     ),
 }
-"""What is made of columns, and learns in the car."""
+"""Columns that are computed from columns, and that learn in the car."""
 
 
 def model_of(
     coefficients: Mapping[str, Fraction], intercept: Fraction = Fraction(0), name: str = "sideslip"
 ) -> Manifest:
     """A manifest of columns of `DEFINITIONS`, of features of 16 bits and of signals."""
-    terms = tuple(_term(one, value) for one, value in coefficients.items())
+    terms = tuple(_term(first_stage, value) for first_stage, value in coefficients.items())
     return manifest(name=name).model_copy(
         update={"terms": terms, "intercept": float(intercept), "intercept_exact": intercept}
     )
@@ -159,8 +166,8 @@ def cars(draw: st.DrawFn) -> Car:
     mass = draw(st.sampled_from([None, 1320.0, 1320.5, 1999.4, 900.0, 1e9, float("nan")]))
     facts = {"mass_kg": mass, "vehicle_model": draw(st.sampled_from([None, "suv", "van"]))}
     number = st.sampled_from([-32767, -3, 0, 2000, 32767])
-    known = draw(st.sets(st.sampled_from(["yaw_rate_offset", "speed_ratio", "understeer"])))
-    return Car(facts, {name: draw(number) for name in sorted(known)})
+    names = draw(st.sets(st.sampled_from(["yaw_rate_offset", "speed_ratio", "understeer"])))
+    return Car(facts, {name: draw(number) for name in sorted(names)})
 
 
 SMALL = Fraction(1, 10**4)
@@ -191,7 +198,7 @@ def hostile_drive(program: Program, ticks: int, seed: int) -> list[Sample]:
     counts[ends] = random.choice([-32768, -30000, 30000, 32767, 0, 1, -1], ends.sum())
     counts[np.repeat(random.random(ticks // 10 + 1) < 0.1, 10)[:ticks]] = -32768
     counts[: ticks // 5] = np.clip(counts[: ticks // 5], 20_000, 30_000)  # sums at their largest
-    return [tuple(None if one == -32768 else one for one in row) for row in counts.tolist()]
+    return [tuple(None if count == -32768 else count for count in row) for row in counts.tolist()]
 
 
 LONGEST = "n" + "_" * 39 + "1"
@@ -207,8 +214,8 @@ def hostile_version() -> ModelVersion:
         for text in TEXTS
     ]
     terms = [
-        suv.model_copy(update={"signal": f"f{i}", "column": f"f{i}", "definition": one})
-        for i, one in enumerate(facts)
+        suv.model_copy(update={"signal": f"f{i}", "column": f"f{i}", "definition": fact})
+        for i, fact in enumerate(facts)
     ]
     manifest = plain_model.model_copy(update={"terms": (signal, *terms)})
     return ModelVersion(1, manifest, "0123" * 16, CATALOG)

@@ -8,8 +8,8 @@ def divide(a: int, b: int) -> int | None:
     return None if b <= 0 else a // b if a >= 0 else -(-a // b)
 
 
-def power(a: int, most: int) -> int:
-    return 1 << next(n for n in range(99) if a <= most << n)
+def power(a: int, bound: int) -> int:
+    return 1 << next(n for n in range(99) if a <= bound << n)
 
 
 def nearest(a: int, b: int) -> int | None:
@@ -31,30 +31,37 @@ def angles(program: Any, facts: Any, numbers: Any, samples: Any) -> list[int | N
     for sample in samples:
         signals = [n if n is not None and s["min"] <= n <= s["max"] else None
                    for n, s in zip(sample, program["signals"], strict=True)]  # fmt: skip
-        given = {"signal": signals, "fact": facts, "number": numbers}
+        inputs = {"signal": signals, "fact": facts, "number": numbers}
         now: list[Any] = []
         following = dict(states)
         past.append(now)
-        for (do, *of), total in zip(program["steps"], sums, strict=True):
+        for (do, *operands), total in zip(program["steps"], sums, strict=True):
             if do in DO:
-                values = [now[i] for i in of]
+                values = [now[i] for i in operands]
                 now.append(None if None in values else DO[do](*values))
-            elif do in ("constant", *given):
-                now.append(of[0] if do == "constant" else given[do][of[0]])
+            elif do in ("constant", *inputs):
+                now.append(operands[0] if do == "constant" else inputs[do][operands[0]])
             elif do == "state":
                 now.append(states[len(now)])
             elif do == "next":
-                following[of[1]] = now[of[0]]
-                now.append(now[of[0]])
+                following[operands[1]] = now[operands[0]]
+                now.append(now[operands[0]])
             elif do == "shift":
-                now.append(None if now[of[0]] is None else nearest(now[of[0]], 1 << of[1]))
+                now.append(
+                    None
+                    if now[operands[0]] is None
+                    else nearest(now[operands[0]], 1 << operands[1])
+                )
             elif do == "else":
-                now.append(now[of[0]] if now[of[0]] is not None else now[of[1]])
+                now.append(now[operands[0]] if now[operands[0]] is not None else now[operands[1]])
             else:
-                new, old = now[of[0]], past[-1 - of[1]][of[0]] if len(past) > of[1] else None
-                if old is not None and of[1]:
+                new, old = (
+                    now[operands[0]],
+                    past[-1 - operands[1]][operands[0]] if len(past) > operands[1] else None,
+                )
+                if old is not None and operands[1]:
                     total[:] = total[0] - old, total[1] - 1
-                if new is not None and do != "ago" and total[1] < of[2]:
+                if new is not None and do != "ago" and total[1] < operands[2]:
                     total[:] = total[0] + new, total[1] + 1
                 now.append(old if do == "ago" else total[do == "values"])
         states = following

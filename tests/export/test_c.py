@@ -48,9 +48,9 @@ def test_hostile_drives_give_the_angles_of_the_kernel(name: str, tmp_path: Path)
     angles: set[int | None] = set()
     for seed, car in enumerate(CARS):
         samples = hostile_drive(program, 400, seed)
-        found = drive(driver, program, car, samples)
-        assert found == angles_by_kernel(SIGNALS, manifest, program, car, samples)
-        angles |= {*found}
+        computed = drive(driver, program, car, samples)
+        assert computed == angles_by_kernel(SIGNALS, manifest, program, car, samples)
+        angles |= {*computed}
     assert len(angles) > 10
     assert None in angles
 
@@ -64,23 +64,23 @@ def test_the_next_drive_remembers_what_was_learned(tmp_path: Path) -> None:
     )
     samples = hostile_drive(program, 300, 5)
     after: dict[int, list[int | None]] = {}
-    for kept in (0, 77, 256, 1000):
-        again = f"if (tick == 200U) {{ PREFIX_next(&state, {kept}U); }}"
+    for retained in (0, 77, 256, 1000):
+        again = f"if (tick == 200U) {{ PREFIX_next(&state, {retained}U); }}"
         driver = build_driver(tmp_path, version, program, before=again)
-        after[kept] = drive(driver, program, CARS[0], samples)[200:]
+        after[retained] = drive(driver, program, CARS[0], samples)[200:]
         estimator = Estimator(CATALOG, manifest)
-        columns = [one.column for one in program.signals]
-        scales = [float(one.scale) for one in program.signals]
+        columns = [signal.column for signal in program.signals]
+        scales = [float(signal.scale) for signal in program.signals]
         stepped = []
         for tick, sample in enumerate(samples):
             if tick == 200:
-                estimator.restart(min(kept, 256))
+                estimator.restart(min(retained, 256))
             values = [None if n is None else n * s for n, s in zip(sample, scales, strict=True)]
             stepped.append(estimator.step(dict(zip(columns, values, strict=True))))
         expected = [None if x is None else x / float(program.angle.scale) for x in stepped[200:]]
-        for found, angle in zip(after[kept], expected, strict=True):
-            assert (found is None) == (angle is None)
-            assert found is None or angle is None or abs(found - angle) <= 1
+        for computed, angle in zip(after[retained], expected, strict=True):
+            assert (computed is None) == (angle is None)
+            assert computed is None or angle is None or abs(computed - angle) <= 1
     assert after[0] == drive(driver, program, CARS[0], samples[200:])
     assert after[256] == after[1000] != after[77] != after[0]
 
@@ -112,7 +112,7 @@ def test_no_bytes_make_the_fuzz_target_overflow(tmp_path: Path) -> None:
     target = compile_c(tmp_path, sources, *SANITIZED)
     for seed, size in enumerate((0, 5, 19, 100_000, 99_999)):
         data = np.random.default_rng(seed).bytes(size)
-        run_compiled([target], given=data)
+        run_compiled([target], data=data)
 
 
 def test_the_self_test_passes_and_notices_another_angle(smoke_root: Path, tmp_path: Path) -> None:
@@ -235,10 +235,10 @@ def text(tmp_path: Path) -> str:
     files = export_texts(ModelVersion(1, MODEL, "0" * 64, CATALOG), None, "c")
     for name, content in files.items():
         (tmp_path / name).write_text(content)
-    found = files["sideslip_any.a2l"]
-    declared = re.search(r"program:\n(.*?) \*/", found, re.DOTALL)
+    document = files["sideslip_any.a2l"]
+    declared = re.search(r"program:\n(.*?) \*/", document, re.DOTALL)
     assert declared is not None
-    measured = re.findall(r"MEASUREMENT (\S+) .*\n  (\w+) .*\n  SYMBOL_LINK \"(\S+)\" 0", found)
+    measured = re.findall(r"MEASUREMENT (\S+) .*\n  (\w+) .*\n  SYMBOL_LINK \"(\S+)\" 0", document)
     assert {symbol for _, _, symbol in measured} >= {"sideslip_any_in.ay_count"}
     checked = "\n    ".join(
         f"{{ const {KINDS[kind]} *const one = &{symbol}; (void)one; }}"
@@ -247,7 +247,7 @@ def text(tmp_path: Path) -> str:
     program = MAIN.replace("DECLARED", declared[1]).replace("CHECKED", checked)
     (tmp_path / "main.c").write_text(program)
     compile_c(tmp_path, ("main.c", "sideslip_any.c"), "-g")
-    return found
+    return document
 
 
 def test_a_program_with_the_variables_has_each_symbol_in_its_type(text: str) -> None:

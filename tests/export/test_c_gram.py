@@ -67,44 +67,44 @@ def counter(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def count_drives(counter: Path, drives: Sequence[tuple[str, int, Any]]) -> bytes:
     """The messages of drives: a car, when it began, and counts, shape (rows, signals)."""
-    given = b""
+    data = b""
     for car, start_s, counts in drives:
         rows = np.zeros(len(counts), [("logged", "<i4"), ("counts", "<i2", len(COUNTED))])
         rows["logged"], rows["counts"] = 1, counts
-        given += struct.pack("<16sQqQ", car.encode(), start_s, 0, len(rows)) + rows.tobytes()
-    return run_compiled([counter], given=given)
+        data += struct.pack("<16sQqQ", car.encode(), start_s, 0, len(rows)) + rows.tobytes()
+    return run_compiled([counter], data=data)
 
 
 def parts_of(content: bytes) -> dict[tuple[str, ...], Gram]:
     """The Grams of the messages of one drive, by signals."""
-    found = {}
+    parts = {}
     for message in parse_messages(content):
         names = tuple(name for i, name in enumerate(COUNTED) if message.mask >> i & 1)
         numbers = np.frombuffer(message.numbers, "<i8").tolist()
         k = len(names)
-        found[names] = Gram(names, message.rows, tuple(numbers[:k]), tuple(numbers[k:]))
-    return found
+        parts[names] = Gram(names, message.rows, tuple(numbers[:k]), tuple(numbers[k:]))
+    return parts
 
 
 def test_each_set_of_signals_has_a_message_and_extremes_are_exact(counter: Path) -> None:
     random = np.random.default_rng(5)
     counts = random.choice([-32767, 32767, 30000, -30000, 0, 1, -1], (5000, len(COUNTED)))
     limits = [(SIGNALS[name].min_count, SIGNALS[name].max_count) for name in COUNTED]
-    low, high = (np.array(one) for one in zip(*limits, strict=True))
+    low, high = (np.array(item) for item in zip(*limits, strict=True))
     counts = np.clip(counts, low, high)
     counts[:1000, 0] = MISSING
     counts[1000:1500, [2, 5]] = MISSING
     counts[1500:1600] = MISSING
     content = count_drives(counter, [("VIN1", 7, counts)])
-    found = parts_of(content)
-    assert sum(one.n for one in found.values()) == 5000
-    for names, gram in found.items():
+    parts = parts_of(content)
+    assert sum(item.n for item in parts.values()) == 5000
+    for names, gram in parts.items():
         at = [COUNTED.index(name) for name in names]
-        others = [i for i in range(len(COUNTED)) if i not in at]
-        mine = np.all(counts[:, at] != MISSING, axis=1)
-        mine &= np.all(counts[:, others] == MISSING, axis=1)
-        assert gram == Gram.from_counts(names, counts[mine][:, at])
-    assert len(found) == 4
+        remaining = [i for i in range(len(COUNTED)) if i not in at]
+        mask = np.all(counts[:, at] != MISSING, axis=1)
+        mask &= np.all(counts[:, remaining] == MISSING, axis=1)
+        assert gram == Gram.from_counts(names, counts[mask][:, at])
+    assert len(parts) == 4
 
 
 def test_rows_of_more_sets_of_signals_are_counted_as_lost(counter: Path) -> None:
@@ -172,30 +172,30 @@ def of_course(tmp_path_factory: pytest.TempPathFactory) -> Counter:
 
 def valid(table: pa.Table) -> pa.Table:
     """A drive whose counts are in the ranges of their signals, as a log's are."""
-    for name, one in SIGNALS.signals.items():
+    for name, signal in SIGNALS.signals.items():
         counts = table[name].cast(pa.int32())
-        counts = pc.max_element_wise(counts, one.min_count, skip_nulls=False)
-        counts = pc.min_element_wise(counts, one.max_count, skip_nulls=False).cast(pa.int16())
+        counts = pc.max_element_wise(counts, signal.min_count, skip_nulls=False)
+        counts = pc.min_element_wise(counts, signal.max_count, skip_nulls=False).cast(pa.int16())
         table = table.set_column(table.schema.get_field_index(name), name, counts)
     return table
 
 
 def grams_of(rows: list[dict[str, Any]], columns: Sequence[str]) -> dict[Any, Gram]:
     """The Gram of each part and set of columns, of some columns alone."""
-    found: dict[Any, Gram] = {}
+    grams: dict[Any, Gram] = {}
     for row in rows:
         names = tuple(filter(None, row["signals"].split(",")))
-        whole = Gram(names, row["n"], tuple(row["sums"]), tuple(row["products"]))
-        few = whole.restrict(tuple(name for name in columns if name in names))
-        key = row["part"], few.signals, row["course_late"] or 0
-        found[key] = found[key] + few if key in found else few
-    return found
+        gram = Gram(names, row["n"], tuple(row["sums"]), tuple(row["products"]))
+        restricted = gram.restrict(tuple(name for name in columns if name in names))
+        key = row["part"], restricted.signals, row["course_late"] or 0
+        grams[key] = grams[key] + restricted if key in grams else restricted
+    return grams
 
 
 def kernel_rows(
     folder: Folder, table: pa.Table, name: str, late: int, configs: Configs = SHIPPED_CONFIGS
 ) -> list[dict[str, Any]]:
-    """What `gram --features` says of the log."""
+    """Return the Gram rows of `gram --features` for the log."""
     warehouse = Warehouse(folder, configs)
     if not warehouse.logs.snapshot().files:
         land(warehouse, "one", table)
@@ -203,8 +203,8 @@ def kernel_rows(
     rows = aggregate(warehouse, files, feature_set=name, delays={"car-1": late})
     if "course_late" not in rows.column_names:
         rows = rows.append_column("course_late", pa.nulls(len(rows), pa.int64()))
-    found: list[dict[str, Any]] = rows.to_pylist()
-    return found
+    result: list[dict[str, Any]] = rows.to_pylist()
+    return result
 
 
 GRAM_ROWS = """
@@ -223,30 +223,39 @@ def received_rows(
     fleet.import_onboard_grams(
         write_counted(root / "rows", rows_of_messages(content, fleet.warehouse.catalog))
     )
-    found: list[dict[str, Any]] = fleet.sql(GRAM_ROWS).to_arrow_table().to_pylist()
-    return found
+    result: list[dict[str, Any]] = fleet.sql(GRAM_ROWS).to_arrow_table().to_pylist()
+    return result
 
 
-LONG = (pytest.param(*one, marks=pytest.mark.long) for one in ((-11, 5), (1, 1), (200, 20)))
+LONG_CASES = (
+    pytest.param(*parameters, marks=pytest.mark.long)
+    for parameters in ((-11, 5), (1, 1), (200, 20))
+)
 
 
-@pytest.mark.parametrize(("late", "every"), [(0, 10), (-40, 10), *LONG])
+@pytest.mark.parametrize(("late", "fix_ticks"), [(0, 10), (-40, 10), *LONG_CASES])
 def test_received_rows_are_those_of_the_log(
-    tmp_path: Path, of_course: Counter, late: int, every: int
+    tmp_path: Path, of_course: Counter, late: int, fix_ticks: int
 ) -> None:
     """With fixes that fail, holes, missing values, standing cars and a course that goes round."""
-    table = valid(hostile_drive("a", 5000, 7, fix_ticks=every))
+    table = valid(hostile_drive("a", 5000, 7, fix_ticks=fix_ticks))
     came = received_rows(tmp_path / "cars", of_course.messages(table, late))
     logs = LocalFolder(tmp_path / "logs")
-    for one in of_course.sets:
-        delay = late if one.counted.in_time else 0
-        mine = [row for row in came if row["feature_set"] == one.counted.identity]
-        expected = grams_of(kernel_rows(logs, table, one.counted.name, delay), one.columns)
-        if one.complete:
-            expected = {k: v for k, v in expected.items() if len(k[1]) in (0, len(one.columns))}
-        assert grams_of(mine, one.columns) == expected, one.counted.name
-        changes = [gram for (_, names, _), gram in expected.items() if names and one.counted.times]
-        assert bool(changes) == bool(one.counted.times)
+    for counted_set in of_course.sets:
+        delay = late if counted_set.counted.in_time else 0
+        received = [row for row in came if row["feature_set"] == counted_set.counted.identity]
+        expected = grams_of(
+            kernel_rows(logs, table, counted_set.counted.name, delay), counted_set.columns
+        )
+        if counted_set.complete:
+            expected = {
+                k: v for k, v in expected.items() if len(k[1]) in (0, len(counted_set.columns))
+            }
+        assert grams_of(received, counted_set.columns) == expected, counted_set.counted.name
+        changes = [
+            gram for (_, names, _), gram in expected.items() if names and counted_set.counted.times
+        ]
+        assert bool(changes) == bool(counted_set.counted.times)
         assert not changes or sum(gram.n for gram in changes) > 20
 
 
@@ -267,17 +276,17 @@ change_s = [3.5, 4, 5]
 def test_several_times_are_parts_of_the_drive(tmp_path: Path) -> None:
     """A set of changes over several times, with a gate."""
     windows = ["ay_mean_16", *PLANE, CATALOG.members("cornering")[0]]
-    own = Configs(tmp_path)
+    configs = Configs(tmp_path)
     (tmp_path / "features.toml").write_text(THREE.format(windows=json.dumps(windows)))
-    catalog = load_catalog(own)
+    catalog = load_catalog(configs)
     sets = sets_on_board(catalog, learned(("ay_mean_16",), "three", catalog))[:2]
     counted = build(tmp_path, sets)
     table = valid(hostile_drive("a", 5000, 3))
-    came = received_rows(tmp_path / "cars", counted.messages(table, 9), own)
-    mine = [row for row in came if row["feature_set"] == catalog.identity("three")]
-    assert {row["part"] for row in mine} == {"3.5 s", "4 s", "5 s"}
-    expected = kernel_rows(LocalFolder(tmp_path / "logs"), table, "three", 9, own)
-    assert grams_of(mine, sets[1].columns) == grams_of(expected, sets[1].columns)
+    came = received_rows(tmp_path / "cars", counted.messages(table, 9), configs)
+    received = [row for row in came if row["feature_set"] == catalog.identity("three")]
+    assert {row["part"] for row in received} == {"3.5 s", "4 s", "5 s"}
+    expected = kernel_rows(LocalFolder(tmp_path / "logs"), table, "three", 9, configs)
+    assert grams_of(received, sets[1].columns) == grams_of(expected, sets[1].columns)
 
 
 def test_nothing_overflows(tmp_path: Path, of_course: Counter) -> None:
@@ -291,11 +300,11 @@ def test_nothing_overflows(tmp_path: Path, of_course: Counter) -> None:
     samples[500:] //= 2**16
     samples[:, 0] = random.random(rows) < 0.99
     for late in (-(2**31), 2**31 - 1, 7):
-        given = struct.pack("<16sQqQ", b"VIN", 2**64 - 1, late, rows) + samples.tobytes()
-        assert run_compiled([sanitized.program], given=given)
+        data = struct.pack("<16sQqQ", b"VIN", 2**64 - 1, late, rows) + samples.tobytes()
+        assert run_compiled([sanitized.program], data=data)
 
 
-def test_what_a_car_is_not_told_it_cannot_count() -> None:
+def test_sets_with_unknown_constants_are_not_counted() -> None:
     with pytest.raises(RefusedError, match="has ay_mean_16_mass: cars count up to 32 columns"):
         sets_on_board(CATALOG, learned(("ay_mean_16_mass",), "course_fleet"))
     many = CATALOG.feature_set("course").windows[:30]

@@ -31,7 +31,7 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 @pytest.mark.tools("clang", "cppcheck")
-def test_what_counts_changes_of_the_course_keeps_the_same_rules(tmp_path: Path) -> None:
+def test_code_that_counts_course_changes_obeys_the_same_rules(tmp_path: Path) -> None:
     write_counter(tmp_path, sets_on_board(CATALOG, learned()))
     run(tmp_path, "clang", *STRICT, "-c", "any_gram.c")
     require_misra(tmp_path, "any_gram.c")
@@ -39,8 +39,8 @@ def test_what_counts_changes_of_the_course_keeps_the_same_rules(tmp_path: Path) 
 
 def require_misra(folder: Path, *files: str) -> None:
     checks = ("--std=c99", "--addon=misra", "--enable=warning,style,portability", "-q")
-    told = run(folder, "cppcheck", *checks, *files)
-    assert set(re.findall(r"\[(\S+)\]$", told, re.M)) <= DEVIATIONS, told
+    report = run(folder, "cppcheck", *checks, *files)
+    assert set(re.findall(r"\[(\S+)\]$", report, re.M)) <= DEVIATIONS, report
 
 
 def run(folder: Path, *words: str) -> str:
@@ -69,11 +69,11 @@ def test_the_self_test_passes_on_a_cortex_m(tmp_path: Path) -> None:
     names = ("mean_3", "mean_5", "sum_4", "change_mean")
     manifest = model_of(dict.fromkeys(names, Fraction(1, 10**4)), Fraction(-1, 700), "any")
     files = export_texts(ModelVersion(1, manifest, "0" * 64, CATALOG), None, "c")
-    found = measure_cortex_m(tmp_path, "sideslip_any", files)
+    costs = measure_cortex_m(tmp_path, "sideslip_any", files)
     assert run_self_test(tmp_path) == 0
-    assert found["with_divisions_of_64_bits_bytes"] < 4096
-    assert found["state_bytes"] + found["largest_frame_bytes"] < 2048
-    assert 100 < found["most_instructions"] < 3000
+    assert costs["with_divisions_of_64_bits_bytes"] < 4096
+    assert costs["state_bytes"] + costs["largest_frame_bytes"] < 2048
+    assert 100 < costs["most_instructions"] < 3000
 
 
 @pytest.mark.tools("arm-none-eabi-gcc", "qemu-system-arm")
@@ -81,10 +81,10 @@ def test_the_self_test_passes_on_a_cortex_m(tmp_path: Path) -> None:
 def test_estimates_for_a_cortex_m_are_above_what_is_measured(tmp_path: Path, name: str) -> None:
     version = ModelVersion(1, model_of(MODELS[name], Fraction(-1, 700), name), "0" * 64, CATALOG)
     estimated = cost_on_board(CATALOG, version.manifest)
-    found = measure_cortex_m(tmp_path, f"sideslip_{name}", export_texts(version, None, "c"))
-    assert found["state_bytes"] == estimated.memory_bytes
-    assert 0.5 < found["most_instructions"] / estimated.estimated_instructions <= 1
-    assert 0.5 < found["with_divisions_of_64_bits_bytes"] / estimated.estimated_code_bytes <= 1
+    costs = measure_cortex_m(tmp_path, f"sideslip_{name}", export_texts(version, None, "c"))
+    assert costs["state_bytes"] == estimated.memory_bytes
+    assert 0.5 < costs["most_instructions"] / estimated.estimated_instructions <= 1
+    assert 0.5 < costs["with_divisions_of_64_bits_bytes"] / estimated.estimated_code_bytes <= 1
 
 
 @pytest.mark.tools("arm-none-eabi-gcc", "qemu-system-arm")
@@ -106,5 +106,5 @@ def test_libfuzzer_finds_nothing(folder: Path) -> None:
     if "libclang_rt.fuzzer" in built.stderr:
         pytest.skip("clang's runtime of libFuzzer is not here: apt-get install libclang-rt-14-dev")
     assert built.returncode == 0, built.stderr
-    given = ("./fuzz", "-seed=1", "-runs=20000", "-max_len=4000", "-rss_limit_mb=512")
-    run_compiled(given, folder)
+    command = ("./fuzz", "-seed=1", "-runs=20000", "-max_len=4000", "-rss_limit_mb=512")
+    run_compiled(command, folder)

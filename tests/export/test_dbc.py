@@ -24,39 +24,39 @@ PROGRAM = compile_program(CATALOG, VERSION.manifest)
 @pytest.fixture(scope="module")
 def bus() -> Database:
     text = export_texts(VERSION, None, "dbc")["sideslip_sideslip.dbc"]
-    found = cantools.database.load_string(text, "dbc")
-    assert isinstance(found, Database)
-    return found
+    database = cantools.database.load_string(text, "dbc")
+    assert isinstance(database, Database)
+    return database
 
 
 def over_the_bus(bus: Database, program: Program, sample: Sample) -> Sample:
     """Encode counts as physical values in messages; return the counts of the decoded ones."""
     counts: dict[str, int] = {}
-    names = [one.name for one in program.signals]
-    known = [-(2**15) if count is None else count for count in sample]
-    given = dict(zip(names, known, strict=True))
+    names = [item.name for item in program.signals]
+    counts_with_code = [-(2**15) if count is None else count for count in sample]
+    frame = dict(zip(names, counts_with_code, strict=True))
     for message in bus.messages[:-1]:
-        raw = {signal.name: given[signal.name] for signal in message.signals}
+        raw = {signal.name: frame[signal.name] for signal in message.signals}
         data = message.encode(raw, scaling=False, strict=False)
         assert len(data) <= 8
         decoded = message.decode(data, scaling=False)
         assert isinstance(decoded, dict)
         counts |= {name: int(str(value)) for name, value in decoded.items()}
-    return tuple(counts[one.name] for one in program.signals)
+    return tuple(counts[item.name] for item in program.signals)
 
 
 def test_a_drive_over_the_bus_gives_the_same_angles(bus: Database) -> None:
     samples: Sequence[Sample] = hostile_drive(PROGRAM, 100, 5)
     received = [over_the_bus(bus, PROGRAM, sample) for sample in samples]
     car = Car({"mass_kg": 1500.0, "vehicle_model": "suv"}, {})
-    sent, found = (
+    sent, angles = (
         angles_by_kernel(SIGNALS, VERSION.manifest, PROGRAM, car, counts)
         for counts in (samples, received)
     )
-    assert found == sent
-    assert len({*found}) > 10
+    assert angles == sent
+    assert len({*angles}) > 10
     angle = bus.get_message_by_name("sideslip_estimate").get_signal_by_name("sideslip")
-    largest = max(abs(one) for one in found if one is not None) * float(PROGRAM.angle.scale)
+    largest = max(abs(value) for value in angles if value is not None) * float(PROGRAM.angle.scale)
     assert angle.maximum is not None
     assert largest <= angle.maximum < 100 * largest
     assert angle.minimum == -angle.maximum
@@ -64,11 +64,11 @@ def test_a_drive_over_the_bus_gives_the_same_angles(bus: Database) -> None:
 
 def test_signals_have_the_scales_units_and_ranges_of_the_catalog(bus: Database) -> None:
     by_name = {signal.name: signal for message in bus.messages for signal in message.signals}
-    for one in PROGRAM.signals:
-        signal = by_name[one.name]
-        assert (signal.scale, signal.unit) == (float(one.scale), one.unit)
-        assert signal.minimum == float(one.min_count * one.scale)
-        assert signal.maximum == float(one.max_count * one.scale)
+    for program_signal in PROGRAM.signals:
+        signal = by_name[program_signal.name]
+        assert (signal.scale, signal.unit) == (float(program_signal.scale), program_signal.unit)
+        assert signal.minimum == float(program_signal.min_count * program_signal.scale)
+        assert signal.maximum == float(program_signal.max_count * program_signal.scale)
     assert [message.cycle_time for message in bus.messages] == [10] * len(bus.messages)
 
 

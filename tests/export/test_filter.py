@@ -84,8 +84,8 @@ def estimate(observer: Observer, counts: DriveCounts) -> FloatArray:
 def test_integers_are_near_the_filter_in_floating_point(name: str) -> None:
     labelled, measures = simulated(), CAR if name == "rear" else FRONT
     expected = ekf.estimate(labelled.signals, vehicle_with_fit(measures), ekf.EkfNoise())
-    found = estimate(OBSERVERS[name], counts_of(labelled, OBSERVERS[name]))
-    error = np.degrees(found - expected)[np.isfinite(found)]
+    estimates = estimate(OBSERVERS[name], counts_of(labelled, OBSERVERS[name]))
+    error = np.degrees(estimates - expected)[np.isfinite(estimates)]
     assert len(error) > 0.95 * len(expected)
     limit = 0.003 if name == "rear" else 0.03  # both front wheels as one
     assert np.sqrt(np.mean(error**2)) < limit < 0.05 * np.degrees(expected.std())

@@ -114,12 +114,12 @@ def test_fmpy_drives_a_whole_drive_as_score_does(smoke_root: Path, tmp_path: Pat
     program = compile_program(CATALOG, version.manifest)
     log = fleet.sql("SELECT * FROM log WHERE drive_id = 'smoke-2024-05-01-0003' ORDER BY tick").pl()
     fleet.models.export(version, "fmu", tmp_path)
-    columns = [one.column for one in program.signals]
+    columns = [signal.column for signal in program.signals]
     scale = float(program.angle.scale)
     predicted = version.predict(log).to_numpy()
     file, rows = tmp_path / "sideslip_smoke_fmi2.fmu", log.select(columns).rows()
-    found = simulate_with_fmpy(file, columns, rows, "sideslip_rad")
-    angles = [round(angle / scale) for angle in found]
+    outputs = simulate_with_fmpy(file, columns, rows, "sideslip_rad")
+    angles = [round(angle / scale) for angle in outputs]
     assert angles == np.floor(predicted / scale + 0.5).astype(int).tolist()
 
 

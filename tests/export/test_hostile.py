@@ -40,7 +40,7 @@ def test_names_are_different_however_they_are_made() -> None:
     assert distinct(["a", "a", "a_2", "a"]) == ("a", "a_2", "a_2_2", "a_3")
     long = distinct(["x" * 40, "x" * 40, "x" * 32, "x" * 30 + "_2"], 32)
     assert len({*long}) == 4
-    assert {len(one) for one in long} == {32}
+    assert {len(name) for name in long} == {32}
 
 
 @needs_cc
@@ -63,10 +63,14 @@ def test_fmus_have_a_parameter_for_each_fact(monkeypatch: pytest.MonkeyPatch) ->
             continue
         with zipfile.ZipFile(BytesIO(content)) as archive:
             root = ElementTree.fromstring(archive.read("modelDescription.xml"))  # noqa: S314 - our own
-        named = [one.attrib for one in root.iter() if {"name", "valueReference"} <= {*one.attrib}]
-        assert len({one["name"] for one in named}) == len(named)
-        assert len({one["valueReference"] for one in named}) == len(named)
-        parameters = [one for one in named if one.get("causality") == "parameter"]
+        named = [
+            element.attrib
+            for element in root.iter()
+            if {"name", "valueReference"} <= {*element.attrib}
+        ]
+        assert len({element["name"] for element in named}) == len(named)
+        assert len({element["valueReference"] for element in named}) == len(named)
+        parameters = [element for element in named if element.get("causality") == "parameter"]
         assert len(parameters) == len(TEXTS)
 
 
@@ -82,10 +86,10 @@ def test_a_dbc_file_is_read_and_names_no_signal_twice() -> None:
 def test_onnx_takes_no_car_at_all() -> None:
     model = exported("onnx")[f"sideslip_{LONGEST}_float32.onnx"]
     session = onnxruntime.InferenceSession(model)
-    width = {one.name: one.shape[1] for one in session.get_inputs()}
+    width = {node.name: node.shape[1] for node in session.get_inputs()}
     kinds = {"signals": np.float32}
-    given = {one: np.empty((0, n), kinds.get(one, np.int64)) for one, n in width.items()}
-    assert session.run(["angle"], given)[0].shape == (0, 1)
+    feeds = {node: np.empty((0, n), kinds.get(node, np.int64)) for node, n in width.items()}
+    assert session.run(["angle"], feeds)[0].shape == (0, 1)
 
 
 def empty_log() -> pl.DataFrame:
@@ -105,7 +109,7 @@ def test_sql_of_a_log_without_rows_has_none() -> None:
     assert by_sqlite(statement.decode(), empty_log()) == {}
 
 
-def test_what_mlflow_loads_takes_no_row_and_names_what_a_frame_lacks() -> None:
+def test_a_model_of_mlflow_takes_empty_frames_and_names_missing_columns() -> None:
     loaded = LoggedVersion(SIGNALS, EMPTY)
     frame: pd.DataFrame = empty_log().to_pandas()
     assert loaded.predict(frame).shape == (0, 1)

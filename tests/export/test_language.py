@@ -62,14 +62,14 @@ def expressions(*, declared: bool) -> st.SearchStrategy[str]:
 
     def larger(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
         pair = st.tuples(inner, st.sampled_from("+-*"), inner).map(lambda x: f"({' '.join(x)})")
-        one = st.tuples(st.sampled_from(["abs", "sign", "-"]), inner).map(
+        unary = st.tuples(st.sampled_from(["abs", "sign", "-"]), inner).map(
             lambda x: f"{x[0]}({x[1]})"
         )
         divisor = st.sampled_from(["2", "7", "40000"]) if declared else inner
-        return pair | one | st.tuples(inner, divisor).map(lambda x: f"({x[0]} // ({x[1]}))")
+        return pair | unary | st.tuples(inner, divisor).map(lambda x: f"({x[0]} // ({x[1]}))")
 
-    found = st.recursive(leaf, larger, max_leaves=6)
-    return found.map(
+    strategy = st.recursive(leaf, larger, max_leaves=6)
+    return strategy.map(
         lambda text: text.replace("(2)", "2").replace("(7)", "7").replace("(40000)", "40000")
     )
 
@@ -93,7 +93,7 @@ BITS = st.sampled_from([16, 18, 20])
 @st.composite
 def definitions(draw: st.DrawFn) -> Definition:
     """A column of any kind: window, factor, gate, number."""
-    found = draw(st.one_of(windows(), windows(), made_of_columns()))
+    definition = draw(st.one_of(windows(), windows(), made_of_columns()))
     kind = draw(st.sampled_from(["window", "window", "fact", "gate", "number"]))
     update: dict[str, Any] = {}
     if kind == "fact":
@@ -116,22 +116,24 @@ def definitions(draw: st.DrawFn) -> Definition:
         update["number"] = ParameterFactor(
             name=name, grain=grain, less=less, alone=alone, running=running_or_none
         )
-    return found.model_copy(update=update)
+    return definition.model_copy(update=update)
 
 
 @st.composite
 def made_of_columns(draw: st.DrawFn) -> Definition:
     """A window over a sum, product or slope of windows, or it now."""
     kind = draw(st.sampled_from(["sum", "product", "slope"]))
-    made: Combination | Product | Slope
+    definition: Combination | Product | Slope
     if kind == "sum":
         times = st.integers(-3000, 3000)
         terms = draw(st.lists(st.tuples(times, windows()), max_size=3))
         intercept = draw(st.integers(-(2**40), 2**40))
-        made = Combination(intercept=intercept, terms=tuple(terms), divisor=draw(DIVISOR))
+        definition = Combination(intercept=intercept, terms=tuple(terms), divisor=draw(DIVISOR))
     elif kind == "product":
         factors = draw(st.lists(windows(), max_size=2))
-        made = Product(of=tuple(factors), ratio=Fraction(draw(st.integers(1, 9)), draw(DIVISOR)))
+        definition = Product(
+            of=tuple(factors), ratio=Fraction(draw(st.integers(1, 9)), draw(DIVISOR))
+        )
     else:
         unknowns = draw(st.integers(1, 4))
         column = windows(st.just(16))
@@ -141,8 +143,8 @@ def made_of_columns(draw: st.DrawFn) -> Definition:
         ridge = st.tuples(*[st.sampled_from([1, 1000, 2**40])] * unknowns)
         ratio = st.sampled_from([Fraction(1), Fraction(10**6), Fraction(1, 7)])
         equations = draw(st.lists(equation, min_size=1, max_size=2))
-        made = Slope(equations=tuple(equations), ridge=draw(ridge), ratio=draw(ratio))
-    row = {"of": f"m_{crc32(repr(made).encode())}", "made": made, "of_bits": draw(BITS)}
+        definition = Slope(equations=tuple(equations), ridge=draw(ridge), ratio=draw(ratio))
+    row = {"of": f"m_{crc32(repr(definition).encode())}", "made": definition, "of_bits": draw(BITS)}
     return draw(windows(BITS, row))
 
 
@@ -153,7 +155,7 @@ DIVISOR = st.sampled_from([1, 7, 1000, 2**20])
 def windows(
     draw: st.DrawFn, bits: st.SearchStrategy[int] = BITS, row: dict[str, Any] | None = None
 ) -> Definition:
-    """What looks back on a signal, a feature or what is made of columns, or is it now."""
+    """Draw windows over a signal, a feature or a computed column, or its present value."""
     over: Over | None = draw(
         st.sampled_from([None, "mean", "sum", "lag", "change", "running_mean"])
     )
@@ -176,18 +178,18 @@ def models(draw: st.DrawFn) -> Manifest:
     terms = tuple(
         ModelTerm(
             signal=f"c{place}", column=f"c{place}", unit="1", scale=Decimal("0.001"),
-            definition=one, coefficient=float(value), coefficient_exact=value,
+            definition=column, coefficient=float(value), coefficient_exact=value,
         )
-        for place, one in enumerate(columns)
+        for place, column in enumerate(columns)
         for value in [Fraction(draw(st.integers(-99, 99)), 10**6)]
     )  # fmt: skip
     return manifest(name="any").model_copy(update={"terms": terms})
 
 
-def compiled(one: Manifest) -> Program:
+def compiled(manifest: Manifest) -> Program:
     """The program; what divides by a constant that is not positive is no example."""
     try:
-        return compile_program(CATALOG, one)
+        return compile_program(CATALOG, manifest)
     except Exception as error:
         assume("divides by a number" not in str(error) and "uses no signal" not in str(error))
         assume("two ways" not in str(error))
@@ -208,25 +210,25 @@ def drives(program: Program) -> st.SearchStrategy[list[list[float]]]:
     row = st.one_of(
         st.tuples(*[value] * len(program.signals)), st.just((np.nan,) * len(program.signals))
     )
-    scales = [float(one.scale) for one in program.signals]
+    scales = [float(signal.scale) for signal in program.signals]
     ticks = st.lists(row, min_size=1, max_size=9)
     return ticks.map(lambda rows: [[x * s for x, s in zip(r, scales, strict=True)] for r in rows])
 
 
 def counts_of(program: Program, values: Sequence[Sequence[float]]) -> list[Sample]:
     """The counts that sensors make of them: to the nearest, halves to even; 16 bits hold them."""
-    scales = [float(one.scale) for one in program.signals]
+    scales = [float(signal.scale) for signal in program.signals]
     rows = [[x / scale for x, scale in zip(row, scales, strict=True)] for row in values]
     return [tuple(round(x) if abs(x) <= 32767 else None for x in row) for row in rows]
 
 
 def judged(program: Program, car: Car, samples: Sequence[Sample]) -> list[int | None]:
     """The angles by the plain interpreter."""
-    told = list(car.fact_counts(program)), list(car.number_counts(program))
-    return plain.angles(program_content(program), *told, samples)
+    constants = list(car.fact_counts(program)), list(car.number_counts(program))
+    return plain.angles(program_content(program), *constants, samples)
 
 
-def by_warehouse(one: Manifest, program: Program, car: Car, samples: Sequence[Sample]) -> Any:
+def by_warehouse(manifest: Manifest, program: Program, car: Car, samples: Sequence[Sample]) -> Any:
     """The angles by the SQL of the warehouse, on counts within their ranges."""
     ends = [(signal.min_count, signal.max_count) for signal in program.signals]
     rows = [
@@ -244,10 +246,13 @@ def by_warehouse(one: Manifest, program: Program, car: Car, samples: Sequence[Sa
     )  # fmt: skip
     with duckdb.connect() as database:
         database.register("log_counts", log.to_arrow())
-        rows_sql = with_columns("log_counts", {}, one.definitions)
-        found = database.sql(f"SELECT * FROM {rows_sql} ORDER BY tick").to_arrow_table()
+        rows_sql = with_columns("log_counts", {}, manifest.definitions)
+        table = database.sql(f"SELECT * FROM {rows_sql} ORDER BY tick").to_arrow_table()
     columns = np.array(
-        [[np.nan if n is None else n for n in found[name].to_pylist()] for name in one.definitions],
+        [
+            [np.nan if n is None else n for n in table[name].to_pylist()]
+            for name in manifest.definitions
+        ],
         dtype=np.float64,
     )
     return angles_of_columns(program, columns)
@@ -259,23 +264,23 @@ def in_counts(program: Program, angles: Sequence[float | None]) -> list[int | No
     return [None if x is None or np.isnan(x) else int(np.floor(x / scale + 0.5)) for x in angles]
 
 
-def close(found: Sequence[int | None], expected: Sequence[int | None]) -> bool:
-    """Whether angles are the same, but for what rounding in binary64 may do at a half."""
+def close(angles: Sequence[int | None], expected: Sequence[int | None]) -> bool:
+    """Return True if angles are equal, except where binary64 rounds a half."""
     return all(
         (a is None) == (b is None) and (a is None or b is None or abs(a - b) <= 1)
-        for a, b in zip(found, expected, strict=True)
+        for a, b in zip(angles, expected, strict=True)
     )
 
 
-def known(program: Program, car: Car) -> dict[str, Any]:
-    """What a car knows, numbers in SI units."""
-    facts = {one.name: car.facts[one.name] for one in program.facts}
-    told = {
+def constants_of(program: Program, car: Car) -> dict[str, Any]:
+    """Return the constants of a car, in SI units."""
+    facts = {fact.name: car.facts[fact.name] for fact in program.facts}
+    numbers = {
         n.name: Decimal(car.numbers[n.name]) * n.grain
         for n in program.numbers
         if n.name in car.numbers
     }
-    return {**facts, **told}
+    return {**facts, **numbers}
 
 
 @settings(
@@ -285,23 +290,23 @@ def known(program: Program, car: Car) -> dict[str, Any]:
 )
 @given(models(), cars(), st.data())
 def test_kernel_warehouse_and_estimator_are_what_the_interpreter_says(
-    one: Manifest, car: Car, data: st.DataObject
+    model: Manifest, car: Car, data: st.DataObject
 ) -> None:
-    program = compiled(one)
+    program = compiled(model)
     values = data.draw(drives(program))
     samples = counts_of(program, values)
     expected = judged(program, car, samples)
-    assert angles_by_kernel(CATALOG.signals, one, program, car, samples) == expected
+    assert angles_by_kernel(CATALOG.signals, model, program, car, samples) == expected
     if not program.numbers:
-        assert by_warehouse(one, program, car, samples) == expected
-    estimator = Estimator(CATALOG, one, known(program, car))
+        assert by_warehouse(model, program, car, samples) == expected
+    estimator = Estimator(CATALOG, model, constants_of(program, car))
     rows = [dict(zip(estimator.columns, row, strict=True)) for row in values]
     stepped = [estimator.step(row) for row in rows]
     assert close(in_counts(program, stepped), expected)
-    told = {name: [value] * len(rows) for name, value in known(program, car).items()}
+    numbers = {name: [value] * len(rows) for name, value in constants_of(program, car).items()}
     missing = {n.name: [np.nan] * len(rows) for n in program.numbers}
-    frame = {c: [row[c] for row in rows] for c in estimator.columns} | missing | told
-    predicted = ModelVersion(1, one, "0" * 64, CATALOG).predict(frame).tolist()
+    frame = {c: [row[c] for row in rows] for c in estimator.columns} | missing | numbers
+    predicted = ModelVersion(1, model, "0" * 64, CATALOG).predict(frame).tolist()
     assert [None if np.isnan(x) else x for x in predicted] == stepped
 
 
@@ -318,35 +323,39 @@ def test_kernel_warehouse_and_estimator_are_what_the_interpreter_says(
 )
 @given(one=models(), car=cars(), data=st.data())
 def test_exports_are_what_the_interpreter_says(
-    one: Manifest, car: Car, data: st.DataObject, tmp_path: Path
+    model: Manifest, car: Car, data: st.DataObject, tmp_path: Path
 ) -> None:
-    program, version = compiled(one), ModelVersion(1, one, "0" * 64, CATALOG)
+    program, version = compiled(model), ModelVersion(1, model, "0" * 64, CATALOG)
     values = data.draw(st.lists(drives(program), min_size=3, max_size=3))
-    samples = [counts_of(program, each) for each in values]
-    expected = [judged(program, car, each) for each in samples]
+    samples = [counts_of(program, drive_values) for drive_values in values]
+    expected = [judged(program, car, drive_values) for drive_values in samples]
     driver = build_driver(tmp_path, version, program)
-    assert [drive(driver, program, car, each) for each in samples] == expected
+    assert [drive(driver, program, car, drive_values) for drive_values in samples] == expected
     log = log_of(program, car, values)
-    there = {(str(d), t): angle for d, each in enumerate(expected) for t, angle in enumerate(each)}
+    expected_angles = {
+        (str(d), t): angle
+        for d, drive_values in enumerate(expected)
+        for t, angle in enumerate(drive_values)
+    }
     statement = export_texts(version, None, "sql")["sideslip_any.sql"]
-    assert by_duckdb(statement, log) == there
-    assert by_sqlite(statement, log) == there
+    assert by_duckdb(statement, log) == expected_angles
+    assert by_sqlite(statement, log) == expected_angles
     session = open_session(version, "float64")
-    for each, angles in zip(values, expected, strict=True):
-        found = run_drives(session, program, [car], np.array([each]))[0]
-        assert close(in_counts(program, found.tolist()), angles)
+    for drive_values, angles in zip(values, expected, strict=True):
+        angles_of_onnx = run_drives(session, program, [car], np.array([drive_values]))[0]
+        assert close(in_counts(program, angles_of_onnx.tolist()), angles)
 
 
 def log_of(program: Program, car: Car, values: Sequence[Sequence[Sequence[float]]]) -> pl.DataFrame:
     """Drives in SI units, null where missing, with what the car knows."""
-    names = [one.column for one in program.signals]
+    names = [signal.column for signal in program.signals]
     parts = [
-        pl.DataFrame(each, dict.fromkeys(names, pl.Float64), orient="row").with_columns(
+        pl.DataFrame(drive_values, dict.fromkeys(names, pl.Float64), orient="row").with_columns(
             pl.lit(str(place)).alias("drive_id"), pl.int_range(pl.len()).alias("tick")
         )
-        for place, each in enumerate(values)
+        for place, drive_values in enumerate(values)
     ]
-    told = {n.name: known(program, car).get(n.name) for n in program.numbers}
+    numbers = {n.name: constants_of(program, car).get(n.name) for n in program.numbers}
     return (
         pl.concat(parts)
         .fill_nan(None)
@@ -355,7 +364,7 @@ def log_of(program: Program, car: Car, values: Sequence[Sequence[Sequence[float]
             pl.lit(car.facts.get("vehicle_model"), pl.String).alias("vehicle_model"),
             *(
                 pl.lit(None if x is None else float(x), pl.Float64).alias(n)
-                for n, x in told.items()
+                for n, x in numbers.items()
             ),
         )
     )
@@ -367,7 +376,7 @@ def log_of(program: Program, car: Car, values: Sequence[Sequence[Sequence[float]
 )
 def test_a_feature_that_can_be_defined_can_be_exported(text: str, divisor: int) -> None:
     try:
-        one = Feature.model_validate(
+        feature = Feature.model_validate(
             {"counts": text, "divided_by": str(divisor) if divisor else None, "scale": 1}
             | {"unit": "1", "column": "any_feature", "description": "any"},
             context=CATALOG.signals,
@@ -376,12 +385,12 @@ def test_a_feature_that_can_be_defined_can_be_exported(text: str, divisor: int) 
         return
     value = Fraction(1, 10**6)
     term = ModelTerm(
-        signal="any_feature", column="any_feature", unit="1", scale=Decimal(1), sql=one.sql,
+        signal="any_feature", column="any_feature", unit="1", scale=Decimal(1), sql=feature.sql,
         coefficient=float(value), coefficient_exact=value,
     )  # fmt: skip
-    made = manifest(name="any").model_copy(update={"terms": (term,)})
-    program = compile_program(CATALOG, made)
+    model = manifest(name="any").model_copy(update={"terms": (term,)})
+    program = compile_program(CATALOG, model)
     samples: list[Sample] = [(n,) * len(program.signals) for n in (None, -3, 0, 7, 30000)]
-    assert angles_by_kernel(CATALOG.signals, made, program, Car({}, {}), samples) == judged(
+    assert angles_by_kernel(CATALOG.signals, model, program, Car({}, {}), samples) == judged(
         program, Car({}, {}), samples
     )

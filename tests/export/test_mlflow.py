@@ -26,9 +26,9 @@ START_S = 120
 
 def folder_of_mlflow() -> Path:
     """The folder of programs of MLflow's own environment, which has fleet-slip too."""
-    found = shutil.which("mlflow")
-    assert found
-    return Path(found).resolve().parent
+    program = shutil.which("mlflow")
+    assert program
+    return Path(program).resolve().parent
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +67,8 @@ def wait_for(uri: str, process: "subprocess.Popen[bytes]") -> None:
 def test_a_registered_version_says_what_it_is(smoke_root: Path) -> None:
     version, client = fleet_slip.open(smoke_root).models.get("smoke"), Mock()
     describe(client, version, "7", {"champion": version.version, "old": version.version + 1})
-    ((told, text),) = client.update_model_version.call_args_list
-    assert told == ("smoke", "7")
+    ((arguments, text),) = client.update_model_version.call_args_list
+    assert arguments == ("smoke", "7")
     assert text["description"].startswith("smoke@1 of fleet_slip, trained on 8 drives where ")
     client.set_registered_model_alias.assert_called_once_with("smoke", "champion", "7")
     assert parameters(version)["drives"] == "8"
@@ -115,14 +115,19 @@ def test_a_version_is_registered_once_and_loads_back(
         assert "in MLflow: logged, version 1" in done.stderr
     drive = "smoke-2024-05-01-0003"
     done = run(programs / "python", "-c", LOAD, server, root, drive)
-    told: dict[str, Any] = json.loads(done.stdout)
+    document: dict[str, Any] = json.loads(done.stdout)
     version = fleet_slip.open(root).models.get("logged")
-    assert (told["equal"], told["rows"], told["versions"], told["example"]) == (True, 3000, 1, True)
-    assert told["tags"]["fleet_slip.sha256"] == version.sha256
-    assert told["tags"]["fleet_slip.reference"] == "logged@1"
+    assert (document["equal"], document["rows"], document["versions"], document["example"]) == (
+        True,
+        3000,
+        1,
+        True,
+    )
+    assert document["tags"]["fleet_slip.sha256"] == version.sha256
+    assert document["tags"]["fleet_slip.reference"] == "logged@1"
     figures = version.manifest.cross_validation
-    assert told["metrics"]["correlation"] == pytest.approx(figures.correlation, rel=1e-12)
-    assert set(version.columns) <= set(told["inputs"])
+    assert document["metrics"]["correlation"] == pytest.approx(figures.correlation, rel=1e-12)
+    assert set(version.columns) <= set(document["inputs"])
 
 
 def run(*words: Any) -> "subprocess.CompletedProcess[str]":
@@ -151,8 +156,8 @@ def test_a_server_that_says_nothing_is_not_waited_for(listening: bool) -> None:
         if listening:
             silent.listen()
         uri = f"http://127.0.0.1:{silent.getsockname()[1]}"
-        told = f"ours@1 is published here, but MLflow rejected it: nothing answers at {uri}"
-        with pytest.raises(StorageError, match=told):
+        message = f"ours@1 is published here, but MLflow rejected it: nothing answers at {uri}"
+        with pytest.raises(StorageError, match=message):
             require_answer(uri, "ours@1", 0.2)
 
 

@@ -35,12 +35,12 @@ def test_hostile_drives_are_within_the_stated_error(name: str, kind: FloatName) 
         ]
     )
     drives = np.array([in_si(program, drive, kind) for drive in samples])
-    found = run_drives(open_session(version, kind), program, CARS, drives)
-    assert found.dtype == kind
-    assert np.array_equal(np.isnan(found), np.isnan(expected))
-    assert 10 < np.isfinite(found).sum() < found.size
+    angles = run_drives(open_session(version, kind), program, CARS, drives)
+    assert angles.dtype == kind
+    assert np.array_equal(np.isnan(angles), np.isnan(expected))
+    assert 10 < np.isfinite(angles).sum() < angles.size
     bound = error_bound(version, program, kind)
-    assert np.nanmax(np.abs(found - expected)) <= bound + 1e-12  # of `predict`, in float64
+    assert np.nanmax(np.abs(angles - expected)) <= bound + 1e-12  # of `predict`, in float64
     assert bound < (1e-3 if kind == "float32" else 1e-11) * np.nanmax(np.abs(expected))
 
 
@@ -54,10 +54,10 @@ def test_a_feature_of_one_value_stands_beside_others(monkeypatch: pytest.MonkeyP
     )
     samples = hostile_drive(program, 50, 1)
     session = open_session(ModelVersion(1, manifest, "0" * 64, CATALOG), "float64")
-    found = run_drives(session, program, CARS[:1], in_si(program, samples, "float64")[None])[0]
+    angles = run_drives(session, program, CARS[:1], in_si(program, samples, "float64")[None])[0]
     expected = predictor(drive_counts(program, predictor, CARS[0], samples))
     assert np.isfinite(expected).any()
-    assert np.allclose(found, expected, rtol=0, atol=1e-12, equal_nan=True)
+    assert np.allclose(angles, expected, rtol=0, atol=1e-12, equal_nan=True)
 
 
 def test_the_files_say_what_they_are_of(smoke_root: Path) -> None:
@@ -75,11 +75,11 @@ def test_the_files_say_what_they_are_of(smoke_root: Path) -> None:
         )
     ]
     model = onnx.load_from_string(files["sideslip_smoke_float32.onnx"])
-    said = {one.key: one.value for one in model.metadata_props}
-    assert (said["model"], said["sha256"]) == ("smoke@1", version.sha256)
-    assert said["drives_sha256"] == version.manifest.trained_on.drives_sha256
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
+    assert (metadata["model"], metadata["sha256"]) == ("smoke@1", version.sha256)
+    assert metadata["drives_sha256"] == version.manifest.trained_on.drives_sha256
     program = compile_program(CATALOG, version.manifest)
-    assert said["error"] == f"{error_bound(version, program, 'float32'):.3g} rad"
+    assert metadata["error"] == f"{error_bound(version, program, 'float32'):.3g} rad"
     assert files == export_files(version, fleet.warehouse, "onnx")
 
 

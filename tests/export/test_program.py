@@ -33,7 +33,7 @@ from tests.export.models import (
 from tests.support.catalog import CATALOG
 
 
-def test_what_divides_by_a_constant_below_zero_has_no_program(
+def test_division_by_a_negative_constant_has_no_program(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(DEFINITIONS, "by_minus_3", Definition(of="x", sql="ay // (-(3))"))
@@ -57,14 +57,14 @@ def test_every_kind_of_column_has_an_angle_in_the_checks() -> None:
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_what_needs_more_than_63_bits_has_no_program(
+def test_columns_of_more_than_63_bits_have_no_program(
     monkeypatch: pytest.MonkeyPatch, sign: int
 ) -> None:
     """20 bits times 2^43 have 62, which rounding doubles: computed exactly, by the kernel, too."""
     column = Definition(of="ay", over="sum", ticks=9, ratio=Fraction(16), bits=20)
     for times in (2**43, 2**44):
-        made = Combination(terms=((sign * times + 1, column),), divisor=2**40)
-        monkeypatch.setitem(LEARNING, "large", Definition(of="large", made=made, bits=20))
+        combination = Combination(terms=((sign * times + 1, column),), divisor=2**40)
+        monkeypatch.setitem(LEARNING, "large", Definition(of="large", made=combination, bits=20))
         manifest = model_of({"large": Fraction(1, 7)})
         if times > 2**43:
             with pytest.raises(QuestionError, match="63 bits"):
@@ -89,8 +89,8 @@ def test_the_angle_is_rounded_halves_up() -> None:
     program = compile_program(CATALOG, model_of({"ay": Fraction(1, 200)}))
     assert program.angle.bits > 40
     assert np.isclose(program.angle.terms[0][1] / 2**program.angle.bits, 0.5)
-    found = plain.angles(program_content(program), [], [], [[-3], [-1], [0], [1], [3]])
-    assert found == [-1, 0, 0, 1, 2]
+    angles = plain.angles(program_content(program), [], [], [[-3], [-1], [0], [1], [3]])
+    assert angles == [-1, 0, 0, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_the_angle_is_rounded_halves_up() -> None:
 def test_a_version_exported_again_has_the_same_steps_in_the_same_order(
     name: str, sha256: str
 ) -> None:
-    """Of programs of version 0.2.0: whoever compares two exports of a version finds no change."""
+    """Digests of programs of version 0.2.0: exports of a version do not change."""
     program = compile_program(CATALOG, model_of(MODELS[name]))
     steps = program_content(program)["steps"]
     assert sha256_of(canonical_json(steps)).startswith(sha256)
@@ -108,11 +108,11 @@ def test_a_version_exported_again_has_the_same_steps_in_the_same_order(
 @pytest.fixture(scope="module")
 def document(smoke_root: Path) -> Any:
     fleet = fleet_slip.open(smoke_root)
-    one, again = (
+    program_content_, again = (
         export_texts(fleet.models.get("smoke"), fleet.warehouse, "json") for _ in range(2)
     )
-    assert one == again
-    return json.loads(one["smoke-1.json"])
+    assert program_content_ == again
+    return json.loads(program_content_["smoke-1.json"])
 
 
 def test_the_checks_hold_and_are_of_no_drive_of_the_logs(document: Any) -> None:
@@ -121,8 +121,8 @@ def test_the_checks_hold_and_are_of_no_drive_of_the_logs(document: Any) -> None:
     assert len(set(document["checks"][0]["angles"]) - {None}) > 50
     assert "2024-05-01-0000" not in json.dumps(document["checks"])
     for check in document["checks"]:
-        given = (check["facts"], check["numbers"], check["samples"])
-        assert plain.angles(document["program"], *given) == check["angles"]
+        arguments = (check["facts"], check["numbers"], check["samples"])
+        assert plain.angles(document["program"], *arguments) == check["angles"]
 
 
 def test_the_document_proves_what_it_is_of(smoke_root: Path, document: Any) -> None:
@@ -137,7 +137,7 @@ def test_the_document_proves_what_it_is_of(smoke_root: Path, document: Any) -> N
     document["sha256"] = stated
 
 
-def test_what_cannot_be_exported_is_said(smoke_root: Path, tmp_path: Path) -> None:
+def test_models_without_a_program_are_refused(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     with pytest.raises(QuestionError, match="no version"):
         fleet.models.export("smoke@9", "json", tmp_path)
@@ -153,13 +153,13 @@ def test_ticks_that_are_skipped_are_missing(ticks: int) -> None:
     for _ in range(5):
         estimator.step({"ay_mps2": 1.0})
     estimator.skip(ticks)
-    there = max(5 - 1 - ticks, 0)
-    counts = Fraction(1000 * there + 3000, 7 * (there + 1))
+    present = max(5 - 1 - ticks, 0)
+    counts = Fraction(1000 * present + 3000, 7 * (present + 1))
     nearest = int(counts + Fraction(1, 2))
     assert estimator.step({"ay_mps2": 3.0}) == nearest * 0.001
 
 
-def test_what_is_missing_or_unknown_is_said() -> None:
+def test_missing_and_unknown_signals_are_named() -> None:
     manifest = model_of({"ay": Fraction(1), "heavy": Fraction(1)})
     with pytest.raises(InputError, match=r"does not use adhesion of a car\. It uses: mass_kg"):
         Estimator(CATALOG, manifest, {"adhesion": 1.0})
@@ -174,7 +174,9 @@ def test_what_is_missing_or_unknown_is_said() -> None:
     assert Estimator(CATALOG, manifest).step({"ay_mps2": 1.0}) is None
 
 
-MANIFESTS = [model_of(of, name=name) for name, of in MODELS.items()] + [hostile_version().manifest]
+MANIFESTS = [model_of(coefficients, name=name) for name, coefficients in MODELS.items()] + [
+    hostile_version().manifest
+]
 
 
 def test_the_statement_says_what_it_is_of() -> None:
@@ -185,7 +187,7 @@ def test_the_statement_says_what_it_is_of() -> None:
         assert "ab" * 32 in text
 
 
-@pytest.mark.parametrize("manifest", MANIFESTS, ids=lambda one: one.name)
+@pytest.mark.parametrize("manifest", MANIFESTS, ids=lambda manifest_: manifest_.name)
 def test_two_engines_give_the_angles_of_the_checks(tmp_path: Path, manifest: Manifest) -> None:
     """Every kind of column: `car` of the check `extremes` knows all facts and numbers."""
     name = manifest.name
@@ -200,5 +202,5 @@ def test_two_engines_give_the_angles_of_the_checks(tmp_path: Path, manifest: Man
     with duckdb.connect() as database:
         database.execute(f"CREATE TABLE checks AS FROM read_csv('{checks}')")
         database.execute(files[f"sideslip_{name}_macro.sql"])
-        found = database.sql(f"SELECT drive_id, tick, angle FROM sideslip_{name}('checks')")
-        assert {(drive, tick): angle for drive, tick, angle in found.fetchall()} == expected
+        table = database.sql(f"SELECT drive_id, tick, angle FROM sideslip_{name}('checks')")
+        assert {(drive, tick): angle for drive, tick, angle in table.fetchall()} == expected

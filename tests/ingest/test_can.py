@@ -367,7 +367,7 @@ def test_a_condition_on_a_state_of_another_message_holds_by_time(
         gears[25] = odd
     text = AX_ALONE.replace("[time]", 'where = [{ column = "Gear.GEAR", one_of = ["D"] }]\n[time]')
     log = read(write_gears(tmp_path, gears), text, STATES)
-    # Where a gear has no name the last one with a name holds on; SNA is a name.
+    # A gear without a name keeps the last one with a name; SNA is a name.
     expected = [i for i in range(40, 100) if odd != 15 or i not in {50, 51}]
     assert log.drives["ax"].to_pylist() == expected
     assert log.counts.quarantined == {}

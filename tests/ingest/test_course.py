@@ -53,7 +53,7 @@ def velocity(time: NDArray[np.float64], x: float = 0.0, y: float = 0.0) -> NDArr
 def logged(fix_s: NDArray[np.float64], rows: NDArray[np.int64]) -> Columns:
     """A log at 100 Hz with fixes in some rows, taken at times of their own; else empty."""
     seen = velocity(fix_s, ANTENNA["antenna_x_m"], ANTENNA["antenna_y_m"])
-    told = {
+    log = {
         "vn": seen.imag,
         "ve": seen.real,
         "cog": np.degrees(np.pi / 2 - np.angle(seen)) % 360,
@@ -63,7 +63,7 @@ def logged(fix_s: NDArray[np.float64], rows: NDArray[np.int64]) -> Columns:
         "t": [f"{t:.2f}" for t in time_s()],
         "r": list(0.3 + 0.2 * np.sin(time_s() / 2)),
     }
-    for name, values in told.items():
+    for name, values in log.items():
         column: list[float | None] = [None] * ROWS
         for row, value in zip(rows.tolist(), values.tolist(), strict=True):
             column[row] = value
@@ -132,24 +132,24 @@ def test_slow_and_sudden_courses_are_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"antenna_x_m": None}, "set antenna_x_m"),
         ({"antenna_x_m": 1200}, "less than or equal to 15"),
         ({"clockwise_from_north": None}, "set clockwise_from_north"),
     ],
 )
-def test_what_a_course_needs_must_be_said(changes: Columns, said: str) -> None:
+def test_a_mapping_of_a_course_needs_its_keys(changes: Columns, message: str) -> None:
     course = {k: v for k, v in {**ANGLE["course"], **changes}.items() if v is not None}
-    with pytest.raises(ValidationError, match=said):
+    with pytest.raises(ValidationError, match=message):
         a_mapping(signals={**ANGLE, "course": course})
 
 
 def test_a_course_comes_with_speed_and_yaw_rate() -> None:
     for needed in ("satellite_speed", "yaw_rate"):
-        some = {name: column for name, column in ANGLE.items() if name != needed}
+        signals = {name: column for name, column in ANGLE.items() if name != needed}
         with pytest.raises(ValidationError, match=f"needs {needed}, too"):
-            a_mapping(signals=some)
+            a_mapping(signals=signals)
     with pytest.raises(ValidationError, match="give the speed too"):
         a_mapping(signals={**VELOCITIES, "satellite_speed": ANGLE["satellite_speed"]})
 
@@ -189,7 +189,7 @@ def test_a_heading_is_a_question_and_no_line(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("one", "other"),
+    ("first", "other"),
     [
         *(("vel_north", "vel_east"), ("gnss_north_mps", "gnss_east_mps"), ("Vn", "Ve")),
         *(("Geschwindigkeit Nord", "Geschwindigkeit Ost"), ("GpsVelN", "GpsVelE")),
@@ -198,42 +198,42 @@ def test_a_heading_is_a_question_and_no_line(tmp_path: Path, name: str) -> None:
     ],
 )
 def test_strangers_call_a_course_and_velocities_otherwise(
-    tmp_path: Path, one: str, other: str
+    tmp_path: Path, first: str, other: str
 ) -> None:
     columns = on_time()
-    if one in {"GPS_Course", "Kurs über Grund", "headMot"}:
-        text = suggested(tmp_path, {one: columns["cog"], other: columns["sog"]})
-        expected: Columns = {"column": one, "unit": "choose", "clockwise_from_north": True}
+    if first in {"GPS_Course", "Kurs über Grund", "headMot"}:
+        text = suggested(tmp_path, {first: columns["cog"], other: columns["sog"]})
+        expected: Columns = {"column": first, "unit": "choose", "clockwise_from_north": True}
         assert tomllib.loads(text)["signals"]["satellite_speed"]["column"] == other
     else:
-        text = suggested(tmp_path, {other: columns["ve"], one: columns["vn"]})
-        unit = "m/s" if "mps" in one else "choose"
-        expected = {"north": one, "east": other, "unit": unit}
+        text = suggested(tmp_path, {other: columns["ve"], first: columns["vn"]})
+        unit = "m/s" if "mps" in first else "choose"
+        expected = {"north": first, "east": other, "unit": unit}
     assert tomllib.loads(text)["signals"]["course"] == expected
     assert "antenna_x_m and antenna_y_m: to be filled in" in text
 
 
 def test_a_course_that_stands_still_while_the_car_turns_is_none(tmp_path: Path) -> None:
     columns = on_time()
-    kept = range(0, ROWS, FIX)
-    for row in kept:
+    fix_rows = range(0, ROWS, FIX)
+    for row in fix_rows:
         columns["cog"][row] = columns["cog"][row - row % (5 * FIX)]
         columns["sog"][row] += row / 1e4
     log = read_columns(tmp_path, columns, a_mapping(signals=ANGLE))
     course, speed = (physical(log, name, 1.0) for name in ("course", "satellite_speed"))
     assert np.flatnonzero(~np.isnan(course)).tolist() == list(range(0, ROWS, 5 * FIX))
-    assert np.flatnonzero(~np.isnan(speed)).tolist() == list(kept)
+    assert np.flatnonzero(~np.isnan(speed)).tolist() == list(fix_rows)
     signals = {
         "course": course * 2 * np.pi / 65536,
         "satellite_speed": speed * 0.005,
         "yaw_rate": np.array(columns["r"]),
     }
-    (found,) = (s for s in check_plausibility(SIGNALS, signals) if "course" in s.signals)
-    assert "80% of its fixes repeat the last" in found.figure
+    (fault,) = (s for s in check_plausibility(SIGNALS, signals) if "course" in s.signals)
+    assert "80% of its fixes repeat the last" in fault.figure
 
 
 def test_driving_backwards_has_no_course(tmp_path: Path) -> None:
-    """Of wheels without a sign: the accelerometer tells."""
+    """For wheels without a sign, the accelerometer decides."""
     columns = on_time()
     ay = 15 * np.array(columns["r"])
     ay[1000:2000] *= -0.2
@@ -252,8 +252,8 @@ def suspected(change: Callable[[Signals], None], slip: float = 1.0) -> list[tupl
     signals = with_course(drive(rng, gentleness=2), rng, slip)
     change(signals)
     satellites = {"course", "satellite_speed"}
-    found = [s for s in check_plausibility(SIGNALS, signals) if satellites & set(s.signals)]
-    return [(s.kind, s.remedy) for s in found]
+    faults = [s for s in check_plausibility(SIGNALS, signals) if satellites & set(s.signals)]
+    return [(s.kind, s.remedy) for s in faults]
 
 
 def shift(place_m: float) -> Callable[[Signals], None]:
@@ -264,7 +264,7 @@ def shift(place_m: float) -> Callable[[Signals], None]:
 
 
 @pytest.mark.parametrize(
-    ("change", "slip", "kind", "said"),
+    ("change", "slip", "kind", "message"),
     [
         (lambda signals: None, 0.0, "no slip", "It is a heading"),
         (shift(-1.5), 1.0, "place", "antenna_x_m"),
@@ -278,12 +278,12 @@ def shift(place_m: float) -> Callable[[Signals], None]:
         (lambda s: s.update(yaw_rate=s["yaw_rate"] * 1.04), 1.0, "scale", "gyroscope"),
     ],
 )
-def test_what_is_no_course_is_suspicious(
-    change: Callable[[Signals], None], slip: float, kind: str, said: str
+def test_a_column_that_is_no_course_is_suspicious(
+    change: Callable[[Signals], None], slip: float, kind: str, message: str
 ) -> None:
     assert suspected(lambda signals: None) == []
-    ((found, remedy),) = suspected(change, slip)
-    assert found == kind and said in remedy
+    ((fault, remedy),) = suspected(change, slip)
+    assert fault == kind and message in remedy
 
 
 def test_fixes_at_irregular_times_come_onto_a_grid_and_lost_rows_are_bridged(
@@ -300,6 +300,6 @@ def test_fixes_at_irregular_times_come_onto_a_grid_and_lost_rows_are_bridged(
     log = read_columns(tmp_path, lost, a_mapping(signals=VELOCITIES))
     assert log.drives.num_rows == rows[-1] + 1, "lost rows are interpolated"
     course = physical(log, "course", 1.0)
-    found = np.flatnonzero(~np.isnan(course))
-    assert (found % FIX == 0).all() and len(found) > 0.95 * ROWS / FIX
+    fix_ticks = np.flatnonzero(~np.isnan(course))
+    assert (fix_ticks % FIX == 0).all() and len(fix_ticks) > 0.95 * ROWS / FIX
     assert np.abs(course_error(log)).max() < 1e-3

@@ -44,8 +44,8 @@ def filled_in(draft: str, units: bool = True) -> str:
     """Return a draft with a day, a car, and the first of the units, where it asks for them."""
     for line in ("day = 2024-05-31  #", 'vehicle_id = ""', 'vehicle_model = ""'):
         draft = draft.replace(f"# {line}", line.replace('""', '"A7"'))
-    asked = r'# Choose the unit: "(.+?)"( with ([^ ]+ = [^ ]+))?( or .*)?\.\n(.*)"choose"'
-    chosen = re.sub(asked, lambda m: f'{m[5]}"{m[1]}"' + (f", {m[3]}" if m[3] else ""), draft)
+    pattern = r'# Choose the unit: "(.+?)"( with ([^ ]+ = [^ ]+))?( or .*)?\.\n(.*)"choose"'
+    chosen = re.sub(pattern, lambda m: f'{m[5]}"{m[1]}"' + (f", {m[3]}" if m[3] else ""), draft)
     return chosen if units else draft
 
 
@@ -140,7 +140,7 @@ def test_a_draft_loads_whatever_the_file_is_called(tmp_path: Path, stem: str) ->
     assert f"# fleet-slip ingest {shlex.quote(f'{tmp_path}/{stem}.parquet')} --mapping" in text
 
 
-def test_what_cannot_be_drafted_says_so(tmp_path: Path) -> None:
+def test_logs_without_a_draft_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "log.csv"
     file.write_text("t,price\n0,1\n1,2\n")
     with pytest.raises(InputError, match="none of its channels looks like a signal: 't', 'price'"):
@@ -167,10 +167,12 @@ def write_bench(file: Path) -> None:
     ]
     for i in range(ROWS):
         moment = (START + timedelta(milliseconds=10 * i)).strftime("%d.%m.%Y %H:%M:%S,%f")[:-3]
-        told = [f"{car[name][i] * factors.get(name, 1.0):.5f}" for name in names]
-        told[2] = "-9999.0" if i % 97 == 3 else told[2]
-        told[-1] = "n.v." if i % 50 == 7 else told[-1].replace(".", ",")
-        lines.append(";".join([moment, *(t.replace(".", ",") if t != "n.v." else t for t in told)]))
+        cells = [f"{car[name][i] * factors.get(name, 1.0):.5f}" for name in names]
+        cells[2] = "-9999.0" if i % 97 == 3 else cells[2]
+        cells[-1] = "n.v." if i % 50 == 7 else cells[-1].replace(".", ",")
+        lines.append(
+            ";".join([moment, *(t.replace(".", ",") if t != "n.v." else t for t in cells)])
+        )
     file.write_bytes("\r\n".join(lines).encode("cp1252"))
 
 
@@ -180,10 +182,13 @@ def write_fleet(file: Path) -> None:
     for number, name in enumerate(("A1", "B2", "C3", "D4")):
         car = a_car(7.0 + number)
         times = [START.replace(tzinfo=None) + timedelta(milliseconds=10 * i) for i in range(ROWS)]
-        told: dict[str, Any] = {"timestamp": times, "vehicle": [name] * ROWS, "trip": number}
-        told |= {"accel_lat (g)": car["ay"] / 9.80665, "yaw_rate (deg/s)": car["yaw_rate"] * TO_DEG}
-        told |= {f"ws_{wheel[-2:]}": car[wheel] * RADIUS_M * 3.6 for wheel in WHEELS}
-        frames.append(pl.DataFrame(told | {"StWhlAng": car["steering_wheel"] * TO_DEG}))
+        columns: dict[str, Any] = {"timestamp": times, "vehicle": [name] * ROWS, "trip": number}
+        columns |= {
+            "accel_lat (g)": car["ay"] / 9.80665,
+            "yaw_rate (deg/s)": car["yaw_rate"] * TO_DEG,
+        }
+        columns |= {f"ws_{wheel[-2:]}": car[wheel] * RADIUS_M * 3.6 for wheel in WHEELS}
+        frames.append(pl.DataFrame(columns | {"StWhlAng": car["steering_wheel"] * TO_DEG}))
     pl.concat(frames).sort("timestamp", maintain_order=True).write_parquet(file)
 
 
@@ -192,25 +197,27 @@ def write_student(file: Path) -> None:
     car = a_car()
     speed = car["wheel_rl"] * RADIUS_M
     vy = speed * np.tan(car["sideslip"])
-    told = {"steer": car["steering_wheel"] * TO_DEG, "yaw": car["yaw_rate"] * TO_DEG}
-    pl.DataFrame({**told, "ax": car["ax"], "ay": car["ay"], "vx": speed, "vy": vy}).write_csv(file)
+    columns = {"steer": car["steering_wheel"] * TO_DEG, "yaw": car["yaw_rate"] * TO_DEG}
+    pl.DataFrame({**columns, "ax": car["ax"], "ay": car["ay"], "vx": speed, "vy": vy}).write_csv(
+        file
+    )
 
 
 def write_bus(file: Path) -> None:
     """UTF-16, milliseconds since 1970, magnitudes with sign bits, 65535 for no value."""
     car = a_car()
-    told: dict[str, Any] = {"utc_ms": round(START.timestamp() * 1000) + 10 * np.arange(ROWS)}
+    columns: dict[str, Any] = {"utc_ms": round(START.timestamp() * 1000) + 10 * np.arange(ROWS)}
     for name, column in (("yaw_rate", "ESP_Gierrate"), ("steering_wheel", "LWI_Lenkradwinkel")):
-        told[f"{column} [°]" if name != "yaw_rate" else f"{column} [°/s]"] = (
+        columns[f"{column} [°]" if name != "yaw_rate" else f"{column} [°/s]"] = (
             np.abs(car[name]) * TO_DEG
         )
-        told[column.replace("_", "_VZ_")] = (car[name] < 0).astype(int)
-    told["Querbeschl. [g]"] = car["ay"] / 9.80665
+        columns[column.replace("_", "_VZ_")] = (car[name] < 0).astype(int)
+    columns["Querbeschl. [g]"] = car["ay"] / 9.80665
     for wheel, place in zip(WHEELS, ("VL", "VR", "HL", "HR"), strict=True):
         kmh = np.round(car[wheel] * RADIUS_M * 3.6, 2)
-        told[f"Radgeschw_{place}"] = np.where(np.arange(ROWS) % 311 == 5, 65535.0, kmh)
-    told["Beta [°]"] = car["sideslip"] * TO_DEG
-    file.write_bytes(pl.DataFrame(told).write_csv(separator="\t").encode("utf-16"))
+        columns[f"Radgeschw_{place}"] = np.where(np.arange(ROWS) % 311 == 5, 65535.0, kmh)
+    columns["Beta [°]"] = car["sideslip"] * TO_DEG
+    file.write_bytes(pl.DataFrame(columns).write_csv(separator="\t").encode("utf-16"))
 
 
 def read(file: Path, mapping: Any) -> tuple[list[MeasuredDrive], IngestCounts]:
@@ -234,10 +241,10 @@ def test_a_strangers_log_becomes_the_drives_that_it_has(tmp_path: Path, name: st
     text = call(tmp_path, "mapping", "suggest", str(tmp_path / name)).partition("\n# A draft")[2]
     mapping = tmp_path / "draft.toml"
     mapping.write_text(f"# {filled_in(text)}", encoding="utf-8")
-    found, counts = read(tmp_path / name, load_mapping(str(mapping), CATALOG))
+    drives_read, counts = read(tmp_path / name, load_mapping(str(mapping), CATALOG))
     assert counts.quarantined == {}
-    assert len(found) == drives
-    for number, drive in enumerate(found):
+    assert len(drives_read) == drives
+    for number, drive in enumerate(drives_read):
         car = a_car(7.0 + number if drives > 1 else 8.0)
         assert set(drive.counts) == signals
         assert_same(drive.counts, car)
@@ -270,8 +277,8 @@ def test_date_and_time_stand_in_columns_of_their_own(tmp_path: Path, column: str
     lines = [f"{column};{clock};ay [m/s²];yaw_rate [°/s];speed [km/h]"]
     for i in range(ROWS):
         moment = start + timedelta(milliseconds=10 * i)
-        told = [car["ay"][i], car["yaw_rate"][i] * TO_DEG, car["wheel_rl"][i] * RADIUS_M * 3.6]
-        values = [f"{value:.4f}" for value in told]
+        cells = [car["ay"][i], car["yaw_rate"][i] * TO_DEG, car["wheel_rl"][i] * RADIUS_M * 3.6]
+        values = [f"{value:.4f}" for value in cells]
         lines.append(";".join([f"{moment:{dated}}", f"{moment:{written}}"[:-3], *values]))
     (tmp_path / "log.csv").write_text("\n".join(lines), encoding="utf-8")
     draft = call(tmp_path, "mapping", "suggest", str(tmp_path / "log.csv"))

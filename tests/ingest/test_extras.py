@@ -86,13 +86,15 @@ def test_extras_are_stored_in_their_units(tmp_path: Path) -> None:
 
 def test_one_angle_of_both_front_wheels_needs_no_line_for_each(tmp_path: Path) -> None:
     columns = {"t": ["0.00", "0.01", "0.02"], "delta": ["1", "", "-3"], "ax": ["0", "0", "0"]}
-    one = {"ax": {"column": "ax", "unit": "m/s^2"}, "steer": EXTRA["steer"]}
-    log = read_columns(tmp_path, columns, a_mapping(signals=one))
+    signals = {"ax": {"column": "ax", "unit": "m/s^2"}, "steer": EXTRA["steer"]}
+    log = read_columns(tmp_path, columns, a_mapping(signals=signals))
     assert log.drives["steer"].to_pylist()[1] is None
     for name in ("steer_fl", "steer_fr"):
         assert log.drives[name].to_pylist() == log.drives["steer"].to_pylist()
-    left = read_columns(tmp_path, columns, a_mapping(signals={**one, "steer_fl": EXTRA["steer"]}))
-    assert left.drives["steer_fr"].null_count == 3
+    one_sided = read_columns(
+        tmp_path, columns, a_mapping(signals={**signals, "steer_fl": EXTRA["steer"]})
+    )
+    assert one_sided.drives["steer_fr"].null_count == 3
 
 
 def test_a_gear_is_never_between_two_gears(tmp_path: Path) -> None:
@@ -119,14 +121,14 @@ def test_a_file_has_the_columns_of_extras_only_where_a_drive_has_them(
     ingest_file(
         warehouse, write(tmp_path / "b.csv", 1), a_mapping(name="two", signals={**PLAIN, **EXTRA})
     )
-    found = "SELECT count(*), count(steer_rad), max(gear_number), max(throttle_position) FROM log"
-    assert ask(warehouse.root, found) == [(2 * ROWS + 1, ROWS + 1, 5.0, 1.0)]
+    query = "SELECT count(*), count(steer_rad), max(gear_number), max(throttle_position) FROM log"
+    assert ask(warehouse.root, query) == [(2 * ROWS + 1, ROWS + 1, 5.0, 1.0)]
     update_grams(warehouse)
     assert set(ask(warehouse.root, "SELECT signals FROM grams")) == {
         ("ax,sideslip",), ("ax,steer_fl,steer_fr,sideslip",),
     }  # fmt: skip
     compact(warehouse)
-    assert ask(warehouse.root, found) == [(2 * ROWS + 1, ROWS + 1, 5.0, 1.0)]
+    assert ask(warehouse.root, query) == [(2 * ROWS + 1, ROWS + 1, 5.0, 1.0)]
     assert not list(verify(warehouse, full=True).damage)
 
 
@@ -165,9 +167,9 @@ def test_a_data_root_of_before_takes_what_has_no_extras_and_asks_to_migrate_for_
     warehouse: Warehouse, tmp_path: Path
 ) -> None:
     shipped = (folder("configs") / "signals.toml").read_text(encoding="utf-8")
-    before, _, rest = shipped.partition("[signals.steer]\n")
+    before, _, tail = shipped.partition("[signals.steer]\n")
     # Without the extras but those that shipped feature sets are of.
-    signals = before + rest[rest.index("[signals.course]") :]
+    signals = before + tail[tail.index("[signals.course]") :]
     old = Warehouse(warehouse.root, configs_with(tmp_path / "configs", signals=signals))
     of_old = a_mapping(signals=PLAIN, catalog=old.catalog)
     ingest_file(old, write(tmp_path / "a.csv"), of_old)

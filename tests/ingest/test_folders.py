@@ -56,11 +56,11 @@ def ingest(folder: Path, *paths: Path) -> list[dict[str, Any]]:
 def drives(folder: Path) -> dict[str, int]:
     """Rows by drive."""
     warehouse = Warehouse(LocalFolder(folder.parent / "root"))
-    found: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for file in warehouse.logs.snapshot().files:
         for name in warehouse.logs.read(file.path, ["drive_id"])["drive_id"].to_pylist():
-            found[name] = found.get(name, 0) + 1
-    return found
+            counts[name] = counts.get(name, 0) + 1
+    return counts
 
 
 def test_the_logs_of_a_folder_land_together_and_once(folder: Path) -> None:
@@ -83,9 +83,9 @@ def test_a_log_is_known_by_its_first_bytes_and_other_files_are_named(folder: Pat
     pq.write_table(pa.table(good_columns(30)), parquet)
     (folder / "car.dbc").write_text("beside the logs")
     (folder / "export.txt").write_text("t,ax\n0,1\n")
-    found = find_logs([folder])
-    assert parquet in found
-    assert [file.name for file in found.passed_over] == ["export.txt", "notes.txt"]
+    logs = find_logs([folder])
+    assert parquet in logs
+    assert [file.name for file in logs.passed_over] == ["export.txt", "notes.txt"]
     root, mapping = folder.parent / "root", folder.parent / "car.toml"
     printed = run_on(root, "ingest", folder, "--mapping", mapping)
     assert printed.exit_code == 0
@@ -106,13 +106,13 @@ def test_a_linked_folder_is_an_error_unless_it_is_read_anyway(folder: Path, targ
 
 
 def test_progress_is_in_files(folder: Path) -> None:
-    told: list[tuple[int, int]] = []
+    steps: list[tuple[int, int]] = []
     fleet = fleet_slip.open(folder.parent / "root")
-    fleet.ingest(folder, a_mapping(), progress=lambda done, total: told.append((done, total)))
-    assert told == [(number, 5) for number in range(1, 6)]
+    fleet.ingest(folder, a_mapping(), progress=lambda done, total: steps.append((done, total)))
+    assert steps == [(number, 5) for number in range(1, 6)]
 
 
-def test_what_lands_does_not_depend_on_batches_or_order(
+def test_stored_rows_do_not_depend_on_batches_or_order(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ingest(folder)
@@ -204,8 +204,8 @@ def test_quarantine_rows_of_a_batch_are_those_of_its_files(folder: Path) -> None
     ingest(folder)
     warehouse = Warehouse(LocalFolder(folder.parent / "root"))
     (file,) = warehouse.quarantine.snapshot().files
-    found = warehouse.quarantine.read(file.path)
-    assert sorted(found["file"].to_pylist()) == ["0.csv", "3.csv"]
+    rows = warehouse.quarantine.read(file.path)
+    assert sorted(rows["file"].to_pylist()) == ["0.csv", "3.csv"]
 
 
 def test_a_pattern_stands_for_what_matches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,7 +232,7 @@ def test_threads_read_small_files_and_large_ones_come_alone(
     write_log(large, rows=200)
 
     def write_and_note(warehouse: Warehouse, mapping: Mapping, files: Any, **more: Any) -> Any:
-        read_by[threading.get_ident()].update(Path(one.file).name for one in files)
+        read_by[threading.get_ident()].update(Path(log.file).name for log in files)
         return write_batch(warehouse, mapping, files, **more)
 
     monkeypatch.setattr(logs, "write_batch", write_and_note)

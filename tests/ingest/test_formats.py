@@ -70,8 +70,8 @@ def write_mdf(folder: Path, *groups: list[Signal], version: str = "4.10", **save
 
 
 def a_x(**changes: Any) -> Signal:
-    whole = {"samples": np.rint(AX * 1000).astype("i2"), "timestamps": TIME_S, "name": "a_x"}
-    return Signal(**{**whole, "conversion": {"a": 0.001, "b": 0.0}, **changes})
+    signal = {"samples": np.rint(AX * 1000).astype("i2"), "timestamps": TIME_S, "name": "a_x"}
+    return Signal(**{**signal, "conversion": {"a": 0.001, "b": 0.0}, **changes})
 
 
 def beta(**changes: Any) -> Signal:
@@ -104,7 +104,7 @@ def test_groups_of_an_mdf_file_keep_their_own_times(tmp_path: Path) -> None:
     np.testing.assert_allclose(placed, BETA_DEG[::5], atol=0.0026)
 
 
-def test_what_mdf_marks_as_invalid_is_null(tmp_path: Path) -> None:
+def test_invalid_samples_of_mdf_are_null(tmp_path: Path) -> None:
     invalid = np.arange(100) % 7 == 0
     file = write_mdf(tmp_path, [a_x(), beta(invalidation_bits=invalid)])
     log = read_measured(file, mdf_mapping())
@@ -120,13 +120,13 @@ def test_a_group_of_an_mdf_file_is_read_window_by_window(
 ) -> None:
     flags = {} if version == "3.30" else {"invalidation_bits": np.arange(100) % 7 == 0}
     file = write_mdf(tmp_path, [a_x(), beta(**flags)], version=version)
-    whole = read_measured(file, mdf_mapping())
+    expected = read_measured(file, mdf_mapping())
     monkeypatch.setattr(mdf, "WINDOW_RECORDS", 33)
     with mdf.open_mdf(Budget.for_file(file), FileFormats()) as source:
         batches = list(source.batches(["a_x", "beta"]))
     assert [batch.height for batch in batches] == [33, 33, 33, 1]
     log = read_measured(file, mdf_mapping())
-    assert log.drives.equals(whole.drives)
+    assert log.drives.equals(expected.drives)
     assert log.drives["sideslip"].null_count == (15 if flags else 0)
 
 
@@ -134,16 +134,16 @@ def test_a_group_of_an_mdf_file_is_read_window_by_window(
 def test_a_large_group_of_an_mdf_file_is_not_read_as_a_whole_for_each_window(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What asammdf takes for large, from 200 MiB on, is here every group."""
+    """Treat every group as asammdf treats groups from 200 MiB on."""
     file = write_mdf(tmp_path, [a_x(), beta()])
-    whole = read_measured(file, mdf_mapping())
+    expected = read_measured(file, mdf_mapping())
 
     def read_all(*_: Any) -> None:
         raise AssertionError("all records are read")
 
     monkeypatch.setattr("asammdf.mdf.validate_blocks", lambda *_: True)
     monkeypatch.setattr("asammdf.mdf.get_channel_raw_bytes_complete", read_all)
-    assert read_measured(file, mdf_mapping()).drives.equals(whole.drives)
+    assert read_measured(file, mdf_mapping()).drives.equals(expected.drives)
 
 
 def test_an_unfinalised_mdf_file_is_read(
@@ -154,14 +154,14 @@ def test_an_unfinalised_mdf_file_is_read(
     data[:8] = b"UnFinMF "
     data[60] = 1  # the cycle counters are not up to date
     file.write_bytes(data)
-    here = tmp_path / "temporary"
-    here.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(here))
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     require_the_drive(read_measured(file, mdf_mapping()))
     file.write_bytes(data[: len(data) // 3])
     failure(file, mdf_mapping())
     gc.collect()
-    assert list(here.iterdir()) == []  # no copy of the recording stays behind
+    assert list(temporary.iterdir()) == []  # no copy of the recording stays behind
     assert capfd.readouterr().err == ""
 
 
@@ -169,9 +169,9 @@ def test_a_condition_of_one_group_holds_for_the_others(tmp_path: Path) -> None:
     fix = Signal(np.array([4, 4, 0, 4] * 5, dtype="u1"), TIME_S[::5], name="fix")
     mapping = mdf_mapping(where=[{"column": "fix", "at_least": 4}])
     log = read_measured(write_mdf(tmp_path, [a_x(), beta()], [fix]), mapping)
-    kept = [i for i in range(100) if (i // 5) % 4 != 2]
-    assert ticks(log) == kept
-    assert log.drives["ax"].to_pylist() == [AX_COUNTS[i] for i in kept]
+    rows = [i for i in range(100) if (i // 5) % 4 != 2]
+    assert ticks(log) == rows
+    assert log.drives["ax"].to_pylist() == [AX_COUNTS[i] for i in rows]
 
 
 def test_a_channel_of_two_groups_must_be_told_apart(tmp_path: Path) -> None:
@@ -224,12 +224,12 @@ def test_a_signal_that_reaches_no_tick_is_named(tmp_path: Path) -> None:
 
 
 def mat_mapping(**changes: Any) -> Mapping:
-    given = {
+    keys = {
         "time": {"column": "Data.t"},
         "drive": {"day": START.date()},
         "signals": signals("Data.Vehicle.ax", "Data.beta(:,2)"),
     }
-    return a_mapping(**{**given, **changes})
+    return a_mapping(**{**keys, **changes})
 
 
 def write_mat5(file: Path, content: dict[str, Any]) -> None:
@@ -237,8 +237,8 @@ def write_mat5(file: Path, content: dict[str, Any]) -> None:
 
 
 def write_mat73(file: Path, content: dict[str, Any]) -> None:
-    def write(group: Any, of: dict[str, Any]) -> None:
-        for name, value in of.items():
+    def write(group: Any, values: dict[str, Any]) -> None:
+        for name, value in values.items():
             if isinstance(value, dict):
                 write(group.create_group(name), value)
             else:  # MATLAB's axes are the other way round, and a vector is a matrix
@@ -260,10 +260,10 @@ def test_matlab(tmp_path: Path, write: Callable[[Path, dict[str, Any]], None]) -
     require_the_drive(read_measured(file, mat_mapping()))
     short = mat_mapping(signals=signals("Data.Vehicle.ax", "gps.beta"))
     assert "'gps.beta' has 50 values and 'Data.t' has 100. Give the signal" in failure(file, short)
-    own = mat_mapping(
+    mapping = mat_mapping(
         signals=signals("Data.Vehicle.ax", "gps.beta", time="gps.t", interpolate=False)
     )
-    log = read_measured(file, own)
+    log = read_measured(file, mapping)
     assert log.drives["ax"].to_pylist() == AX_COUNTS
     assert log.drives["sideslip"].drop_null().to_pylist() == BETA_COUNTS[::2]
     draft = write_draft(draft_mapping(SIGNALS, file, profile_file(file)), "draft")
@@ -377,9 +377,9 @@ def test_every_format_says_the_same(tmp_path: Path, name: str) -> None:
     assert ticks(log) == list(range(logs.ROWS))
     np.testing.assert_allclose(physical(log, "ax", 0.001), logs.AX, atol=1e-6)
     sideslip = physical(log, "sideslip", 0.0001)
-    known = np.isfinite(sideslip)
-    assert known.sum() == logs.ROWS - ("mdf4" in name)  # whose first value is marked as invalid
-    np.testing.assert_allclose(sideslip[known], np.radians(logs.BETA)[known], atol=5.1e-5)
+    finite = np.isfinite(sideslip)
+    assert finite.sum() == logs.ROWS - ("mdf4" in name)  # whose first value is marked as invalid
+    np.testing.assert_allclose(sideslip[finite], np.radians(logs.BETA)[finite], atol=5.1e-5)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.7, 0.99])
@@ -395,10 +395,10 @@ def test_a_file_that_was_cut_is_refused(
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.parametrize("here", ["UTC", "Asia/Tokyo"])
+@pytest.mark.parametrize("reader_zone", ["UTC", "Asia/Tokyo"])
 @pytest.mark.parametrize("version", ["3.00", "4.10"])
 def test_a_clock_without_a_zone_does_not_depend_on_the_zone_of_the_reader(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str, here: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str, reader_zone: str
 ) -> None:
     with MDF(version=version) as file:
         file.append([a_x()])
@@ -407,7 +407,7 @@ def test_a_clock_without_a_zone_does_not_depend_on_the_zone_of_the_reader(
         else:
             file.start_time = START.replace(tzinfo=None)
         log = Path(file.save(tmp_path / "log", overwrite=True))
-    monkeypatch.setenv("TZ", here)
+    monkeypatch.setenv("TZ", reader_zone)
     time.tzset()
     try:
         for zone, hour in ((None, 12), ("America/New_York", 16)):

@@ -1,4 +1,4 @@
-"""What a mapping can say: of the file, of a column, and of rows that are left out."""
+"""Keys of a mapping: for the file, for a column, and for rows that are left out."""
 
 import math
 import re
@@ -157,8 +157,8 @@ def test_an_unknown_name_lists_the_known_ones() -> None:
 def test_tyres_need_a_column_of_the_catalog(tmp_path: Path) -> None:
     shipped = SHIPPED_CONFIGS.file("signals.toml").read_text(encoding="utf-8")
     start = shipped.index("[drive.tyres]")
-    own = shipped[:start] + shipped[shipped.index("[drive.adhesion]") :]
-    catalog = load_catalog(configs_with(tmp_path / "configs", signals=own))
+    text = shipped[:start] + shipped[shipped.index("[drive.adhesion]") :]
+    catalog = load_catalog(configs_with(tmp_path / "configs", signals=text))
     with pytest.raises(ConfigError, match=r"drive\.tyres: the catalog has no such drive"):
         load(tmp_path, GOOD.replace('"m" }', '"m", tyres = "winter" }'), catalog)
     assert load(tmp_path, GOOD, catalog)
@@ -166,9 +166,9 @@ def test_tyres_need_a_column_of_the_catalog(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("fact", ["tyres", "receiver"])
 def test_a_fact_of_a_column_is_known_of_each_drive(tmp_path: Path, fact: str) -> None:
-    said = GOOD.replace('"m" }', f'"m", {fact} = {{ column = "shoes" }} }}')
+    text = GOOD.replace('"m" }', f'"m", {fact} = {{ column = "shoes" }} }}')
     columns = {"t": [0, 0.01, 0, 0.01], "shoes": ["slick"] * 2 + ["wet"] * 2, "a": [0.1] * 4}
-    mapping = load(tmp_path, said.replace(STEER, ""))
+    mapping = load(tmp_path, text.replace(STEER, ""))
     drives = read_columns(tmp_path, columns, mapping).drives.to_pylist()
     assert {d[fact] for d in drives} == {"slick", "wet"}
 
@@ -223,22 +223,22 @@ def test_placing_keeps_values_and_invents_none(steps: list[float], delay_s: floa
     values = np.arange(1.0, time_s.size + 1)
     grid = choose_grid(time_s, 0.1)
     placed = place_samples(time_s - delay_s, values, grid)
-    kept = placed[np.isfinite(placed)]
+    finite = placed[np.isfinite(placed)]
     assert placed.shape == grid.ticks.shape
-    assert set(kept) <= set(values)
-    assert (np.diff(kept) > 0).all()
+    assert set(finite) <= set(values)
+    assert (np.diff(finite) > 0).all()
 
 
 def test_keys_at_their_default_do_not_change_the_identity_of_a_file(tmp_path: Path) -> None:
     plain = a_mapping()
-    said = a_mapping(
+    explicit = a_mapping(
         signals={
             "ax": {"column": "ax", "unit": "m/s^2", "gain": 1.0, "delay_s": 0.0},
             "sideslip": {"column": "beta", "unit": "deg", "interpolate": True},
         },
         where=[],
     )
-    assert read_columns(tmp_path, good_columns(), said).digest == (
+    assert read_columns(tmp_path, good_columns(), explicit).digest == (
         read_columns(tmp_path, good_columns(), plain).digest
     )
     # The digest of the release before these keys.
@@ -251,13 +251,13 @@ def test_the_label_is_moved_to_the_centre_of_gravity(tmp_path: Path) -> None:
     vy = speed * np.tan(car["sideslip"]) + car["yaw_rate"] * 1.5
     columns = {"r": car["yaw_rate"], "v": speed, "vy": vy, "b": np.arctan2(vy, speed)}
     assert np.abs(columns["b"] - car["sideslip"]).max() > 0.04
-    told = {"t": np.arange(speed.size) / 100, **columns}
+    columns_of_log = {"t": np.arange(speed.size) / 100, **columns}
     rate, moved = {"yaw_rate": {"column": "r", "unit": "rad/s"}}, {"sensor_x_m": 1.5}
     mps: dict[str, Any] = {"column": "v", "unit": "m/s"}
     angle = {"vehicle_speed": mps, "sideslip": {"column": "b", "unit": "rad"}}
     pair = {"vx": mps, "vy": {"column": "vy", "unit": "m/s"}}
-    for some, label in ((angle, moved), (pair, {**moved, "from_velocities": True})):
-        log = read_columns(tmp_path, told, a_mapping(signals=rate | some, label=label))
+    for signals, label in ((angle, moved), (pair, {**moved, "from_velocities": True})):
+        log = read_columns(tmp_path, columns_of_log, a_mapping(signals=rate | signals, label=label))
         assert np.abs(physical(log, "sideslip", 1e-4) - car["sideslip"]).max() < 6e-4
 
 
@@ -314,7 +314,7 @@ def columns() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("where", "kept"),
+    ("where", "remaining"),
     [
         ([{"column": "speed", "at_least": 5}], [1, 2, *range(5, 20)]),
         ([{"column": "speed", "above": 5}], [2, *range(5, 20)]),
@@ -329,7 +329,7 @@ def columns() -> dict[str, Any]:
     ],
 )
 def test_rows_that_do_not_meet_the_conditions_are_counted(
-    tmp_path: Path, where: Any, kept: list[int]
+    tmp_path: Path, where: Any, remaining: list[int]
 ) -> None:
     rows = columns()
     rows["v"] = [18 if v is None else "" if v == "n/a" else 3.6 * v for v in rows["speed"]]
@@ -338,10 +338,10 @@ def test_rows_that_do_not_meet_the_conditions_are_counted(
         "vehicle_speed": {"column": "v", "unit": "km/h"},
     }
     log = read_columns(tmp_path, rows, a_mapping(where=where, signals=signals))
-    first = kept[0]
-    assert ticks(log) == [tick - first for tick in kept]
-    assert (log.counts.rows_read, log.counts.rows_left_out) == (20, 20 - len(kept))
-    assert (log.counts.rows_kept, log.counts.quarantined) == (len(kept), {})
+    first = remaining[0]
+    assert ticks(log) == [tick - first for tick in remaining]
+    assert (log.counts.rows_read, log.counts.rows_left_out) == (20, 20 - len(remaining))
+    assert (log.counts.rows_kept, log.counts.quarantined) == (len(remaining), {})
 
 
 @pytest.mark.parametrize(
@@ -355,7 +355,7 @@ def test_rows_that_do_not_meet_the_conditions_are_counted(
         ([{"column": "speed", "at_least": 1}] * 65, "at most 64 items"),
     ],
 )
-def test_what_a_condition_cannot_be(where: Any, message: str) -> None:
+def test_invalid_conditions_are_refused(where: Any, message: str) -> None:
     with pytest.raises(ValidationError, match=re.escape(message)):
         a_mapping(where=where)
 
@@ -395,8 +395,8 @@ def test_a_drive_ends_where_the_ignition_is_off(tmp_path: Path) -> None:
     assert log.counts.ticks == 2 * 391
     assert log.counts.quarantined == {}
     short = {"longest_gap_s": 0.2, "split_gap_s": 2}
-    whole = read_columns(tmp_path, rows, a_mapping(where=IGNITION, time=short))
-    assert whole.counts.drives == 1
+    drives = read_columns(tmp_path, rows, a_mapping(where=IGNITION, time=short))
+    assert drives.counts.drives == 1
 
 
 @pytest.mark.parametrize(

@@ -82,12 +82,12 @@ def write(file: Path, compression: CompressionType = CompressionType.LZ4) -> Pat
 
 
 def mapping(**signals: Any) -> Mapping:
-    told = {
+    document = {
         "ax": {"column": "/imu/data.linear_acceleration.x", "unit": "m/s^2"},
         "sideslip": {"column": "/joints.velocity[1]", "unit": "deg"},
         **signals,
     }
-    return own_clock(signals=told)
+    return own_clock(signals=document)
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
@@ -108,7 +108,7 @@ def write_json(
         writer = PlainWriter(stream)
         writer.start()
         schema = writer.register_schema("imu", "jsonschema", b"{}")
-        channels = [writer.register_channel("imu", one, schema) for one in encodings]
+        channels = [writer.register_channel("imu", encoding, schema) for encoding in encodings]
         for i, message in enumerate(messages):
             now = START_NS + i * 10**7
             writer.add_message(channels[i % 2], now, json.dumps(message).encode(), now)

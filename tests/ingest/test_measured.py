@@ -34,7 +34,7 @@ def test_the_table_has_the_schema_of_the_logs(tmp_path: Path) -> None:
     log = read_columns(tmp_path, good_columns())
     table = log.drives.cast(schema_without(SIGNALS.extras))
     first = table.slice(0, 1).to_pylist()[0]
-    known = {
+    facts = {
         "day": date(2024, 5, 31),
         "drive_id": f"test-{log.digest[:12]}-1",
         "vehicle_id": "car",
@@ -51,7 +51,7 @@ def test_the_table_has_the_schema_of_the_logs(tmp_path: Path) -> None:
         "ax": -1000,
         "sideslip": 0,
     }
-    assert {name: value for name, value in first.items() if value is not None} == known
+    assert {name: value for name, value in first.items() if value is not None} == facts
     assert log.quarantine.schema == quarantine_schema()
     assert log.quarantine.num_rows == 0
 
@@ -242,7 +242,7 @@ def test_polars_does_not_warn_of_a_format_in_its_own_words(
     mapping = a_mapping(time={"unit": None, "format": "%d.%m.%Y %H:%M:%S.%f"}, drive={"day": None})
     with pytest.raises(InputError, match="19 time_duplicate"):
         read_columns(tmp_path, columns, mapping)
-    assert [one for one in recwarn if "%f" in str(one.message)] == []
+    assert [warning for warning in recwarn if "%f" in str(warning.message)] == []
 
 
 @pytest.mark.parametrize("rate_hz", [20, 50, 64, 100.4, 250, 1000])
@@ -283,7 +283,9 @@ def test_a_rate_too_low_to_interpolate_leaves_what_was_measured(tmp_path: Path) 
         read_columns(tmp_path, columns, a_mapping(time={"longest_gap_s": 0.001}))
 
 
-def test_what_is_absurd_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_absurd_numbers_of_drives_and_keys_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     columns = good_columns(300)
     columns["run"] = [i // 3 for i in range(300)]
     monkeypatch.setattr(measured_log, "MAX_DRIVES", 99)
@@ -301,13 +303,13 @@ def test_what_is_absurd_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_the_result_depends_on_bytes_and_mapping_only(tmp_path: Path) -> None:
     text = csv_text(good_columns())
-    one = read_text(tmp_path, text)
+    first = read_text(tmp_path, text)
     (tmp_path / "elsewhere").mkdir()
     two = read_text(tmp_path / "elsewhere", text)
-    assert one.digest == two.digest
-    assert one.drives.equals(two.drives)
-    assert read_text(tmp_path, text + "\n").digest != one.digest
-    assert read_text(tmp_path, text, a_mapping(missing=["-"])).digest != one.digest
+    assert first.digest == two.digest
+    assert first.drives.equals(two.drives)
+    assert read_text(tmp_path, text + "\n").digest != first.digest
+    assert read_text(tmp_path, text, a_mapping(missing=["-"])).digest != first.digest
 
 
 bad_rows = st.lists(
@@ -358,15 +360,15 @@ def test_every_row_is_kept_or_quarantined(
 
 
 @pytest.mark.parametrize(
-    ("day", "kept"),
+    ("day", "accepted"),
     [("1969-12-31", False), ("1970-01-01", True), ("2199-12-31", True), ("2200-01-01", False)],
 )
-def test_days_of_two_centuries_are_kept(tmp_path: Path, day: str, kept: bool) -> None:
+def test_days_of_two_centuries_are_kept(tmp_path: Path, day: str, accepted: bool) -> None:
     good = good_columns(20)
     columns = {**good, "d": ["2024-05-31"] * 10 + [day] * 10}
     log = read_columns(tmp_path, columns, a_mapping(drive={"day": {"column": "d"}}))
-    assert log.counts.quarantined == ({} if kept else {"out_of_range": 10})
-    assert (date.fromisoformat(day) in log.drives["day"].to_pylist()) is kept
+    assert log.counts.quarantined == ({} if accepted else {"out_of_range": 10})
+    assert (date.fromisoformat(day) in log.drives["day"].to_pylist()) is accepted
 
 
 def test_the_worked_example_of_the_docs(tmp_path: Path) -> None:

@@ -67,7 +67,10 @@ def test_a_log_without_wheel_speeds_gives_its_model_through_the_shipped_mapping(
         1,
     )
     again = ingest_file(warehouse, file, load_mapping("race_car_250lm", CATALOG))
-    assert [(one.new, one.drives_forgotten) for one in (report, again)] == [(True, 0), (False, 0)]
+    assert [(report_.new, report_.drives_forgotten) for report_ in (report, again)] == [
+        (True, 0),
+        (False, 0),
+    ]
     update_grams(warehouse)
     with connect(warehouse.root, query="drives, log") as database:
         answer = database.sql("SELECT vehicle_id, mass_kg, adhesion, rows FROM drives").fetchall()
@@ -81,8 +84,8 @@ def test_a_log_without_wheel_speeds_gives_its_model_through_the_shipped_mapping(
     ):
         signal = SIGNALS[name]
         half_a_count = 0.5001 * float(signal.scale)
-        given = np.array(columns[column]) * unit
-        np.testing.assert_allclose(rows[signal.column], given, rtol=0, atol=half_a_count)
+        values = np.array(columns[column]) * unit
+        np.testing.assert_allclose(rows[signal.column], values, rtol=0, atol=half_a_count)
     (table,) = load_cohort(warehouse).tables
     fitted = fit(table.total(), list(COEFFICIENTS), "sideslip")
     scales = {name: s.exact_scale for name, s in SIGNALS.signals.items()}
@@ -113,7 +116,7 @@ def trailing_mean(values: np.ndarray, ticks: int = 16) -> np.ndarray:
     return np.array([values[max(0, i + 1 - ticks) : i + 1].mean() for i in range(len(values))])
 
 
-def test_what_a_log_remembers_is_found_and_carries_to_blocks_it_was_not_fitted_to(
+def test_memory_of_a_log_is_selected_and_holds_on_held_out_blocks(
     tmp_path: Path,
 ) -> None:
     """From the file to `--group-by part`: blocks of time left out of the training."""
@@ -123,11 +126,11 @@ def test_what_a_log_remembers_is_found_and_carries_to_blocks_it_was_not_fitted_t
     models.write_text(MODELS)
     call(root, "ingest", str(file), "--mapping", "race_car_250lm_speed")
     call(root, "gram", "--features", "blocks")
-    asked = ("select", "--group-by", "part", "--models", str(models), "--json")
-    found = json.loads(call(root, *asked))
+    command = ("select", "--group-by", "part", "--models", str(models), "--json")
+    document = json.loads(call(root, *command))
     names = ["block 0001", "block 0002"]
-    assert [one["fold"] for one in found["models"][0]["folds"]] == names
-    instant, remembering = found["models"]
+    assert [fold["fold"] for fold in document["models"][0]["folds"]] == names
+    instant, remembering = document["models"]
     assert remembering["rmse_deg"] == pytest.approx(np.degrees(NOISE_RAD), rel=0.05)
     assert instant["rmse_deg"] > 2 * remembering["rmse_deg"]
     last = remembering["folds"][-1]

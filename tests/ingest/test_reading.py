@@ -75,13 +75,13 @@ def test_blocks_are_cut_at_lines_and_not_within_quotes(
     columns = good_columns(200)
     columns["note"] = ['"a\nb ""c""\n"' if i % 3 else "é" for i in range(200)]
     text = csv_text(columns)
-    whole = read_text(tmp_path, text)
+    expected = read_text(tmp_path, text)
     for size in (32, 61, 100):
         monkeypatch.setattr(csv_batches, "BLOCK_BYTES", size)
         pieces = read_text(tmp_path, text)
-        assert pieces.drives.equals(whole.drives)
-        assert pieces.counts == whole.counts
-    assert ticks(whole) == list(range(200))
+        assert pieces.drives.equals(expected.drives)
+        assert pieces.counts == expected.counts
+    assert ticks(expected) == list(range(200))
 
 
 def test_a_line_with_more_fields_than_the_header_is_quarantined(tmp_path: Path) -> None:
@@ -221,16 +221,16 @@ def parquet(folder: Path, **columns: Any) -> Path:
 
 
 def test_parquet_types_that_are_numbers(tmp_path: Path) -> None:
-    whole = pa.array(range(20))
+    integers = pa.array(range(20))
     for numbers in (
-        whole.cast(pa.int8()),
-        whole.cast(pa.uint64()),
-        whole.cast(pa.float32()),
-        whole.cast(pa.decimal128(21, 2)),
-        whole.cast(pa.string()),
-        whole.cast(pa.large_string()),
-        whole.dictionary_encode(),
-        whole.cast(pa.string()).dictionary_encode(),
+        integers.cast(pa.int8()),
+        integers.cast(pa.uint64()),
+        integers.cast(pa.float32()),
+        integers.cast(pa.decimal128(21, 2)),
+        integers.cast(pa.string()),
+        integers.cast(pa.large_string()),
+        integers.dictionary_encode(),
+        integers.cast(pa.string()).dictionary_encode(),
     ):
         log = read_measured(parquet(tmp_path, ax=numbers), a_mapping())
         assert log.drives["ax"].to_pylist() == [1000 * i for i in range(20)]
@@ -331,9 +331,9 @@ def test_compressed_text_gives_the_same_counts_under_any_name(
 
 @both
 def test_a_truncated_file_is_no_shorter_drive(tmp_path: Path, compress: Compress) -> None:
-    whole = compress(TEXT)
-    for kept in (len(whole) // 2, len(whole) - 1):
-        assert "Truncated compressed stream" in refusal(tmp_path, whole[:kept])
+    content = compress(TEXT)
+    for length in (len(content) // 2, len(content) - 1):
+        assert "Truncated compressed stream" in refusal(tmp_path, content[:length])
 
 
 def test_a_flipped_bit_is_noticed_by_the_checksum_of_gzip(tmp_path: Path) -> None:
@@ -343,9 +343,7 @@ def test_a_flipped_bit_is_noticed_by_the_checksum_of_gzip(tmp_path: Path) -> Non
 
 
 @both
-def test_what_would_not_fit_into_memory_is_refused_while_it_unfolds(
-    tmp_path: Path, compress: Compress
-) -> None:
+def test_decoded_data_beyond_memory_are_refused(tmp_path: Path, compress: Compress) -> None:
     bomb = compress(TEXT + b"9" * (10 * BLOCK_BYTES))
     assert len(bomb) < BLOCK_BYTES / 50
     assert "a line is longer than" in refusal(tmp_path, bomb)
@@ -367,11 +365,11 @@ def test_a_full_disk_is_an_error_that_names_the_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    kept = Spool()
-    kept._file.close()
-    kept._file = _Full()  # type: ignore[assignment]
+    spool = Spool()
+    spool._file.close()
+    spool._file = _Full()  # type: ignore[assignment]
     with pytest.raises(InputError, match=r"no room for a temporary copy .*TMPDIR") as caught:
-        kept.add(1, b"much")
+        spool.add(1, b"much")
     assert str(caught.value).startswith(str(tmp_path))
 
 

@@ -26,7 +26,7 @@ def corrected(**changes: object) -> Mapping:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def filled_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording and another one, and a root with Gram rows of them."""
     folder = tmp_path_factory.mktemp("made")
     fleet = fleet_slip.open(folder / "data")
@@ -37,19 +37,19 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def fleet(made: Path, tmp_path: Path) -> Fleet:
+def fleet(filled_root: Path, tmp_path: Path) -> Fleet:
     """A copy of that."""
-    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(filled_root, tmp_path, dirs_exist_ok=True)
     return fleet_slip.open(tmp_path / "data")
 
 
 def drives(fleet: Fleet) -> dict[str, float]:
     """Mean side-slip angle by file; a file twice would be an error."""
-    found = fleet.sql(
+    rows = fleet.sql(
         "SELECT source_file, count(DISTINCT drive_id), avg(sideslip_rad) FROM log GROUP BY ALL"
     ).fetchall()
-    assert all(many == 1 for _, many, _ in found)
-    return {file: mean for file, _, mean in found}
+    assert all(many == 1 for _, many, _ in rows)
+    return {file: mean for file, _, mean in rows}
 
 
 def test_a_corrected_mapping_replaces_what_came_through_the_old_one(

@@ -50,7 +50,7 @@ def strangers() -> dict[str, list[Named]]:
     """Return the columns of each log."""
     with NAMES.open(encoding="utf-8", newline="") as stream:
         rows = [Named(**row) for row in csv.DictReader(stream)]
-    return {log: list(of) for log, of in groupby(rows, lambda row: row.log)}
+    return {log: list(columns) for log, columns in groupby(rows, lambda row: row.log)}
 
 
 def score(columns: list[Named], folder: Path) -> Counter[str]:
@@ -75,27 +75,30 @@ def _on_one_line(match: re.Match[str]) -> str:
 
 def _judge(columns: list[Named], text: str) -> Counter[str]:
     text = _KEY_A_LINE.sub(_on_one_line, text)
-    asked = [
+    choices = [
         line.replace('"choose"', unit.replace(" with", ","))
         for units, line in re.findall(r"^# Choose the unit: (.*)\.\n(.*)", text, re.MULTILINE)
         for unit in units.split(" or ")
     ]
     text = re.sub(r"^.*\"choose\".*$", "", text, flags=re.MULTILINE)
     lines = tomllib.loads(text).get("signals", {})
-    asked += re.findall(r"^# (\w+ = \{.*\})", text, re.MULTILINE)
-    found: Counter[str] = Counter()
+    choices += re.findall(r"^# (\w+ = \{.*\})", text, re.MULTILINE)
+    verdicts: Counter[str] = Counter()
     for column in columns:
         if not column.signal:
             continue
         if column.signal in lines:
             keys = lines.pop(column.signal)
-            found["right" if _is_right(column, keys) else "wrong"] += 1
+            verdicts["right" if _is_right(column, keys) else "wrong"] += 1
         else:
-            alternatives = [tomllib.loads(line) for line in asked]
-            right = any(_is_right(column, one.get(column.signal, {})) for one in alternatives)
-            found["asked" if right else "missing"] += 1
-    found["extra"] += len(lines)
-    return found
+            alternatives = [tomllib.loads(line) for line in choices]
+            right = any(
+                _is_right(column, alternative.get(column.signal, {}))
+                for alternative in alternatives
+            )
+            verdicts["asked" if right else "missing"] += 1
+    verdicts["extra"] += len(lines)
+    return verdicts
 
 
 def _is_right(column: Named, keys: dict[str, Any]) -> bool:
@@ -103,10 +106,10 @@ def _is_right(column: Named, keys: dict[str, Any]) -> bool:
         return False
     if column.sign and keys.get("sign", {}).get("column") != column.sign:
         return False
-    told = {key: value for key, value in keys.items() if key != "longest_gap_s"}
+    given_keys = {key: value for key, value in keys.items() if key != "longest_gap_s"}
     si_unit = SIGNALS[column.signal].unit
     try:
-        gain, _ = SignalColumn.model_validate(told).linear(si_unit)
+        gain, _ = SignalColumn.model_validate(given_keys).linear(si_unit)
     except ValueError:
         return False
     return bool(np.isclose(gain, 1 / _per_si(column), rtol=1e-2))
@@ -137,10 +140,10 @@ def _write(file: Path, columns: list[Named]) -> None:
         if not column.signal:
             values[column.name] = _other(column.measured_in, car, number)
             continue
-        told = car[column.signal] * _per_si(column)
-        values[column.name] = np.abs(told) if column.sign else told
+        samples = car[column.signal] * _per_si(column)
+        values[column.name] = np.abs(samples) if column.sign else samples
         if column.sign:
-            values[column.sign] = (told < 0).astype(np.float64)
+            values[column.sign] = (samples < 0).astype(np.float64)
     units = {column.name: column.unit for column in columns}
     time_s = np.arange(ROWS) / 100
     if columns[0].layout == "mdf":
@@ -188,10 +191,10 @@ LESS_THAN_ALL = {"carsim": 4, "grapro": 0}
 @pytest.mark.parametrize("log", LOGS)
 def test_no_line_of_a_draft_is_wrong(tmp_path: Path, log: str) -> None:
     columns = LOGS[log]
-    found = score(columns, tmp_path)
+    verdicts = score(columns, tmp_path)
     signals = sum(bool(column.signal) for column in columns)
-    assert (found["wrong"], found["extra"]) == (0, 0)
-    assert found["right"] + found["asked"] >= LESS_THAN_ALL.get(log, signals)
+    assert (verdicts["wrong"], verdicts["extra"]) == (0, 0)
+    assert verdicts["right"] + verdicts["asked"] >= LESS_THAN_ALL.get(log, signals)
 
 
 def test_half_of_the_logs_judge_and_each_names_its_source() -> None:

@@ -76,11 +76,11 @@ def cut(
 def test_blocks_change_nothing(
     rows: list[tuple[int, float]], sizes: list[int], longest_s: float
 ) -> None:
-    whole = cut(rows, [], longest_s)
-    assert cut(rows, sizes, longest_s) == whole
-    kept = [row for part in whole[0] for row in part]
-    assert sorted(kept + [row for row, _ in whole[1]]) == list(range(1, len(rows) + 1))
-    for part in whole[0]:
+    expected = cut(rows, [], longest_s)
+    assert cut(rows, sizes, longest_s) == expected
+    rows_of_drives = [row for part in expected[0] for row in part]
+    assert sorted(rows_of_drives + [row for row, _ in expected[1]]) == list(range(1, len(rows) + 1))
+    for part in expected[0]:
         moments = [rows[row - 1][1] for row in part]
         assert moments == sorted(set(moments))
         assert moments[-1] - moments[0] < longest_s
@@ -101,7 +101,7 @@ def test_a_drive_that_lasts_too_long_is_cut(
 
 
 @pytest.mark.parametrize(("limit", "files"), [(1, 3), (40, 2), (10_000, 1)])
-def test_what_lands_does_not_depend_on_the_size_of_data_files(
+def test_stored_rows_do_not_depend_on_the_size_of_data_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, files: int
 ) -> None:
     monkeypatch.setattr(logs, "FILE_ROWS", limit)
@@ -118,10 +118,10 @@ def test_what_lands_does_not_depend_on_the_size_of_data_files(
         for table in (warehouse.logs, warehouse.quarantine)
     )
     assert len(warehouse.logs.snapshot().files) == files
-    whole = read_measured(tmp_path / "log.csv", a_mapping())
+    expected = read_measured(tmp_path / "log.csv", a_mapping())
     order = [("drive_id", "ascending"), ("tick", "ascending")]
     stored = stored.set_column(0, "drive_id", stored["drive_id"].cast(pa.string())).sort_by(order)
-    assert stored["ax"].to_pylist() == whole.drives["ax"].to_pylist()
+    assert stored["ax"].to_pylist() == expected.drives["ax"].to_pylist()
     assert sorted(refused["row"].to_pylist()) == [4, 71]
     assert not ingest_file(warehouse, tmp_path / "log.csv", a_mapping()).new
 
@@ -148,7 +148,7 @@ def _land_in(root: Path, file: Path) -> list[str]:
     warehouse = Warehouse(LocalFolder(root))
     ingest_file(warehouse, file, a_mapping())
     tables = (warehouse.logs, warehouse.quarantine)
-    return sorted(one.path for table in tables for one in table.snapshot().files)
+    return sorted(data_file.path for table in tables for data_file in table.snapshot().files)
 
 
 def test_nothing_is_left_of_a_file_that_fails_at_its_end(
@@ -176,12 +176,12 @@ def test_drives_that_alternate_are_the_same_sorted_in_files(
     columns["ax"][7] = "x"
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 200)
     mapping = a_mapping(drive={"column": "run"}, time={"longest_gap_s": 0.1})
-    whole = read_columns(tmp_path, columns, mapping)
+    expected = read_columns(tmp_path, columns, mapping)
     monkeypatch.setattr(drives, "MAX_VALUES_IN_MEMORY", values)
     spilled = read_columns(tmp_path, columns, mapping)
-    assert spilled.drives.equals(whole.drives)
-    assert spilled.counts == whole.counts
-    assert whole.counts.drives == 5
+    assert spilled.drives.equals(expected.drives)
+    assert spilled.counts == expected.counts
+    assert expected.counts.drives == 5
 
 
 @pytest.mark.parametrize("returns", [False, True])
@@ -189,7 +189,7 @@ def test_drives_that_alternate_are_the_same_sorted_in_files(
 def test_drives_whose_rows_are_together_end_with_their_last_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int, *, returns: bool
 ) -> None:
-    """Of three drives the second has a gap, and the third an isolated last row."""
+    """Three drives: the second has a gap, and the third an isolated last row."""
     columns: dict[str, list[Any]] = {**good_columns(60)}
     columns["run"] = [f"run {i // 20}" for i in range(60)]
     columns["t"] = [f"{i / 100 + 5 * (28 < i < 40) + 9 * (i == 59):.2f}" for i in range(60)]
@@ -233,16 +233,16 @@ def test_plain_numbers_are_those_of_their_texts(
     def read(plain: PlainNumbers) -> pl.Series:
         return pl.concat(CsvSource(Budget.for_file(file), form, plain).batches(["a"]))["a"]
 
-    found = read(PlainNumbers(frozenset({"a"}), (-99.0, float("nan"))))
-    told = read(PlainNumbers())
-    if found.dtype == pl.String:
-        assert found.equals(told)
+    fast = read(PlainNumbers(frozenset({"a"}), (-99.0, float("nan"))))
+    parsed = read(PlainNumbers())
+    if fast.dtype == pl.String:
+        assert fast.equals(parsed)
         return
-    plain = told.str.strip_chars()
+    plain = parsed.str.strip_chars()
     plain = plain.str.replace(",", ".", literal=True) if comma else plain
     expected = plain.cast(pl.Float64, strict=False)
-    assert found.to_numpy().tobytes() == expected.to_numpy().tobytes()
-    assert np.isfinite(found.to_numpy()).all()
+    assert fast.to_numpy().tobytes() == expected.to_numpy().tobytes()
+    assert np.isfinite(fast.to_numpy()).all()
 
 
 def test_items_are_read_ahead_in_order_and_errors_come_in_their_place() -> None:
@@ -271,8 +271,8 @@ def test_items_are_read_ahead_in_order_and_errors_come_in_their_place() -> None:
 def drive(name: str, rows: int) -> MeasuredDrive:
     """Return a drive whose car is called like it, with `ax` in the order of its ticks."""
     ticks = np.arange(rows, dtype=np.int32)
-    known = {"drive_id": name, "vehicle_id": f"car of {name}", "day": date(2024, 5, 31)}
-    metadata = {**known, "rows": rows, "track": None}
+    facts = {"drive_id": name, "vehicle_id": f"car of {name}", "day": date(2024, 5, 31)}
+    metadata = {**facts, "rows": rows, "track": None}
     return MeasuredDrive(name, metadata, "snap", ticks, {"ax": as_arrow(ticks.astype(np.int16))})
 
 
@@ -280,9 +280,9 @@ def drive(name: str, rows: int) -> MeasuredDrive:
 def test_every_row_says_what_is_known_of_its_drive(sizes: list[int]) -> None:
     drives = [drive(f"drive {i}", rows) for i, rows in enumerate(sizes)]
     table = log_table(drives, a_mapping(signals={"ax": {"column": "ax", "unit": "m/s^2"}}))
-    rows = [(one, tick) for one in drives for tick in one.ticks.tolist()]
+    rows = [(drive_, tick) for drive_ in drives for tick in drive_.ticks.tolist()]
     for column in ("drive_id", "vehicle_id", "rows", "day", "track"):
-        assert table[column].to_pylist() == [one.metadata[column] for one, _ in rows]
+        assert table[column].to_pylist() == [drive_.metadata[column] for drive_, _ in rows]
     assert table["tick"].to_pylist() == [tick for _, tick in rows]
     assert pa.types.is_dictionary(table["drive_id"].type)
     assert table["vx"].null_count == len(rows)

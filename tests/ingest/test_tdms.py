@@ -33,8 +33,8 @@ def test_groups_of_several_rates_are_one_drive(tmp_path: Path) -> None:
     log = read_measured(write(tmp_path / "log.tdms", [ax, beta]), own_clock())
     assert ticks(log) == list(range(200))
     np.testing.assert_allclose(physical(log, "ax", 0.001), fast, atol=1e-9)
-    found = physical(log, "sideslip", 0.0001)[:191]
-    np.testing.assert_allclose(found, np.radians(fast[:191]), atol=5.1e-5)
+    sideslip = physical(log, "sideslip", 0.0001)[:191]
+    np.testing.assert_allclose(sideslip, np.radians(fast[:191]), atol=5.1e-5)
     assert log.drives["day"].unique().to_pylist() == [START.date()]
 
 
@@ -53,8 +53,8 @@ def test_a_column_of_timestamps_is_the_time(tmp_path: Path) -> None:
 def test_a_channel_of_several_groups_is_named_with_its_group(tmp_path: Path) -> None:
     both = [ChannelObject(group, "ax", np.ones(50), wave(0.01)) for group in "ab"]
     file = write(tmp_path / "log.tdms", both)
-    asked = own_clock(signals={"ax": {"column": "ax", "unit": "m/s^2"}})
-    assert "Its columns are 'ax@a', 'ax@b'." in failure(file, asked)
+    mapping = own_clock(signals={"ax": {"column": "ax", "unit": "m/s^2"}})
+    assert "Its columns are 'ax@a', 'ax@b'." in failure(file, mapping)
     assert read(file, "ax@b")["ax@b"].to_list() == [1.0] * 50
 
 
@@ -100,11 +100,11 @@ def test_values_do_not_depend_on_segments_or_blocks(
         ],
     )
     with mock.patch.object(matlab, "WINDOW_ROWS", ahead):
-        found = read(file, "plain")
-        assert found["plain"].to_list() == values.astype(float).tolist()
+        samples = read(file, "plain")
+        assert samples["plain"].to_list() == values.astype(float).tolist()
         assert read(file, "scaled")["scaled"].to_list() == (0.5 * values + 2.0).tolist()
     step = np.arange(len(values)) * 0.01
-    np.testing.assert_allclose(found[OWN_TIME] - START.timestamp(), step, atol=1e-6)
+    np.testing.assert_allclose(samples[OWN_TIME] - START.timestamp(), step, atol=1e-6)
 
 
 def text(value: str) -> bytes:
@@ -127,9 +127,17 @@ def test_a_file_that_ends_too_early_is_refused_wherever_it_was_cut(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = tmp_path / "log.tdms"
-    whole = a_segment(np.ones((30, 2)))
-    for cut in [5, 27, 40, len(whole) - 1, len(whole) + 5, len(whole) + 60, 2 * len(whole) - 1]:
-        file.write_bytes((whole + whole)[:cut])
+    content = a_segment(np.ones((30, 2)))
+    for cut in [
+        5,
+        27,
+        40,
+        len(content) - 1,
+        len(content) + 5,
+        len(content) + 60,
+        2 * len(content) - 1,
+    ]:
+        file.write_bytes((content + content)[:cut])
         assert "ends too early" in failure(file, own_clock()), cut
     assert not caplog.records  # npTDMS would write its own words to the terminal
 

@@ -38,19 +38,19 @@ class FakeSource(Source):
         return [Channel(name) for frame in self._frames for name in frame.columns[1:]]
 
     def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
-        wanted = (frame for frame in self._frames if {*columns} & {*frame.columns})
-        return [self._read(frame, columns) for frame in wanted]
+        frames = (frame for frame in self._frames if {*columns} & {*frame.columns})
+        return [self._read(frame, columns) for frame in frames]
 
     def _read(self, frame: pl.DataFrame, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
-        some = frame.select(OWN_TIME, *(name for name in columns if name in frame.columns))
-        if not some.height:
-            yield some
-        yield from some.iter_slices(self._batch)
+        selected = frame.select(OWN_TIME, *(name for name in columns if name in frame.columns))
+        if not selected.height:
+            yield selected
+        yield from selected.iter_slices(self._batch)
 
 
 def reason_and_place(times: Sequence[float]) -> list[tuple[str | None, float]]:
-    """What is wrong with each time of a base, and the last right one, told one by one."""
-    found: list[tuple[str | None, float]] = []
+    """Return the fault of each time of a base, and the last valid time, one by one."""
+    result: list[tuple[str | None, float]] = []
     right = -math.inf
     for i, time in enumerate(times):
         inside = 0 < i < len(times) - 1
@@ -59,27 +59,27 @@ def reason_and_place(times: Sequence[float]) -> list[tuple[str | None, float]]:
             reason = "isolated"
         elif math.isfinite(time):
             right = max(right, time)
-        found.append((reason, right))
-    return found
+        result.append((reason, right))
+    return result
 
 
 def merged(bases: Sequence[Sequence[tuple[float, float | None]]]) -> list[tuple[Any, ...]]:
     """All rows as (place, base, row, time, value, reason, held): the value of base 0 is held."""
-    rows, said = [], []
-    for of, samples in enumerate(bases):
+    rows, faults = [], []
+    for base, samples in enumerate(bases):
         judged = reason_and_place([time for time, _ in samples])
         pairs = zip(samples, judged, strict=True)
         for number, ((time, value), (reason, place)) in enumerate(pairs, 1):
-            rows.append((place, of, number, time, value, reason))
-            if of == 0 and reason is None and value is not None and math.isfinite(time):
-                said.append((time, value))
+            rows.append((place, base, number, time, value, reason))
+            if base == 0 and reason is None and value is not None and math.isfinite(time):
+                faults.append((time, value))
     rows.sort(key=lambda row: row[0])
-    whole = []
+    result = []
     for row in rows:
-        before = [(time, value) for time, value in said if time <= row[0]]
+        before = [(time, value) for time, value in faults if time <= row[0]]
         held = before[-1][1] if before and row[0] - before[-1][0] <= GAP_S else None
-        whole.append((*row, held))
-    return whole
+        result.append((*row, held))
+    return result
 
 
 times = st.integers(0, 60).map(lambda tenths: tenths / 10)
@@ -95,11 +95,11 @@ samples = st.lists(st.tuples(moments, st.one_of(st.none(), st.floats(0, 9))), ma
     st.integers(1, 30),
 )
 def test_windows_say_what_the_whole_says(
-    told: list[list[tuple[float, float | None]]], ordered: list[bool], window: int, batch: int
+    time_bases: list[list[tuple[float, float | None]]], ordered: list[bool], window: int, batch: int
 ) -> None:
     bases = [
         sorted(rows, key=lambda row: row[0]) if flag else rows
-        for rows, flag in zip(told, ordered, strict=False)
+        for rows, flag in zip(time_bases, ordered, strict=False)
     ]
     frames = [
         pl.DataFrame(rows, schema={OWN_TIME: pl.Float64, f"v{i}": pl.Float64}, orient="row")
@@ -109,11 +109,11 @@ def test_windows_say_what_the_whole_says(
     columns = [f"v{i}" for i in range(len(frames))]
     with mock.patch.object(batches, "WINDOW_ROWS", window):
         windows = list(merge_bases(source.bases(columns), OWN_TIME, ["v0"], GAP_S, columns))
-    some = [rows for rows in bases if rows]
-    if len(some) < 2:
-        found = [row for rows in windows for row in rows.select(OWN_TIME, *columns).rows()]
+    filled = [rows for rows in bases if rows]
+    if len(filled) < 2:
+        actual = [row for rows in windows for row in rows.select(OWN_TIME, *columns).rows()]
         expected = [row for frame in frames for row in frame.rows()]
-        assert repr([tuple(v for v in row if v is not None) for row in found]) == repr(
+        assert repr([tuple(v for v in row if v is not None) for row in actual]) == repr(
             [tuple(v for v in row if v is not None) for row in expected]
         )
         return
@@ -121,15 +121,19 @@ def test_windows_say_what_the_whole_says(
         return  # the held column is of a base without rows
     value = pl.coalesce(columns).alias("value")
     told_by = [rows.select(BASE, ROW, OWN_TIME, value, DISORDER, HELD + "v0") for rows in windows]
-    found = [row for rows in told_by for row in rows.rows()]
-    expected = [row[1:] for row in merged(some)]
-    assert repr(sorted(found, key=itemgetter(0, 1))) == repr(sorted(expected, key=itemgetter(0, 1)))
-    assert usable(found) == usable(expected)
+    actual = [row for rows in told_by for row in rows.rows()]
+    expected = [row[1:] for row in merged(filled)]
+    assert repr(sorted(actual, key=itemgetter(0, 1))) == repr(
+        sorted(expected, key=itemgetter(0, 1))
+    )
+    assert usable(actual) == usable(expected)
 
 
 def usable(rows: list[tuple[Any, ...]]) -> list[tuple[int, int]]:
     """Base and number of the rows at right times, in their order; where others are is all one."""
-    return [(of, row) for of, row, time, _, reason, _ in rows if not reason and math.isfinite(time)]
+    return [
+        (base, row) for base, row, time, _, reason, _ in rows if not reason and math.isfinite(time)
+    ]
 
 
 def read_in(
@@ -174,7 +178,7 @@ def clocks(draw: st.DrawFn, rate_hz: float) -> FloatArray:
 
 @settings(max_examples=25, deadline=None)
 @given(st.data())
-def test_what_becomes_of_a_log_does_not_depend_on_windows(
+def test_the_result_of_a_log_does_not_depend_on_windows(
     tmp_path_factory: Any, data: st.DataObject
 ) -> None:
     folder = tmp_path_factory.mktemp("windows")
@@ -202,16 +206,16 @@ def test_what_becomes_of_a_log_does_not_depend_on_windows(
         },
         **more,
     )
-    whole = read_in(folder, frames, mapping, 10**9, 10**9)
+    expected = read_in(folder, frames, mapping, 10**9, 10**9)
     window, batch = data.draw(st.integers(8, 200)), data.draw(st.integers(8, 200))
-    found = read_in(folder, frames, mapping, window, batch)
-    if isinstance(whole, str) or isinstance(found, str):
-        assert found == whole
+    actual = read_in(folder, frames, mapping, window, batch)
+    if isinstance(expected, str) or isinstance(actual, str):
+        assert actual == expected
         return
-    assert found.drives.equals(whole.drives)
+    assert actual.drives.equals(expected.drives)
     order = [(name, "ascending") for name in ("row", "reason", "signal")]
-    assert found.quarantine.sort_by(order).equals(whole.quarantine.sort_by(order))
-    assert found.counts == whole.counts
+    assert actual.quarantine.sort_by(order).equals(expected.quarantine.sort_by(order))
+    assert actual.counts == expected.counts
 
 
 def test_stretches_are_numbered_in_the_order_of_time(tmp_path: Path) -> None:

@@ -50,8 +50,8 @@ def write(
     """Write a second of a drive at 100 Hz; return its text."""
     lines = []
     for i in range(ROWS):
-        hours, rest = divmod((first_s + i / 100) % 86_400, 3600)
-        clock = f"{hours:02.0f}{rest // 60:02.0f}{rest % 60:05.2f}"
+        hours, remainder = divmod((first_s + i / 100) % 86_400, 3600)
+        clock = f"{hours:02.0f}{remainder // 60:02.0f}{remainder % 60:05.2f}"
         lines.append(f"137 {clock} +03120.0 +00060.0 040.0 093.5 +0152.6 +{i / 100:.2f} -{i:.1f}")
     text = head.format(created=created) + "\n".join(lines) + "\n"
     file.write_text(text, encoding="utf-8")
@@ -76,7 +76,7 @@ def test_columns_have_their_units_and_the_clock_its_date(tmp_path: Path) -> None
         physical(log, "ay", 0.001)[::33], [0, 3.236, 6.472, 9.709], atol=1e-3
     )
     with open_source(tmp_path / "a.vbo", FileFormats()) as source:
-        units = {one.name: one.unit for one in source.channels()}
+        units = {channel.name: channel.unit for channel in source.channels()}
         (rows,) = source.batches(["sats", "lat", "long"])
     assert units == {
         **{"sats": "", "lat": "deg", "long": "deg", "velocity": "knot", "heading": "deg"},
@@ -130,11 +130,11 @@ def test_every_line_is_read_or_refused_for_itself(
     (tmp_path / "b.vbo").write_bytes(change(text).encode())
     log = read_measured(tmp_path / "b.vbo", mapping())
     assert [(row, reason, signal) for row, reason, signal in reasons(log)] == refused
-    kept = [
+    lines = [
         tick for tick in range(log.counts.rows_read) if tick + 1 not in {r for r, *_ in refused}
     ]
     for name in ("tick", "ay", "yaw_rate", "vehicle_speed"):
-        assert log.drives[name].to_pylist() == [sound.drives[name][i].as_py() for i in kept]
+        assert log.drives[name].to_pylist() == [sound.drives[name][i].as_py() for i in lines]
 
 
 def _comma(text: str) -> str:
@@ -152,7 +152,9 @@ def _comma(text: str) -> str:
         ("31/05/2024", "31/06/2024", "its clock has no date"),
     ],
 )
-def test_what_a_file_lacks_is_said(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_missing_parts_of_a_file_are_named(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
     text = write(tmp_path / "a.vbo")
     (tmp_path / "a.vbo").write_text(text.replace(old, new))
     assert message in failure(tmp_path / "a.vbo", mapping())

@@ -55,19 +55,19 @@ def uncalibrated(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
     folder = tmp_path_factory.mktemp("course")
     file = folder / "received.toml"
     file.write_text(CAMPAIGN)
-    made = fleet_slip.open(folder / "data")
-    made.simulate(str(file))
+    fleet = fleet_slip.open(folder / "data")
+    fleet.simulate(str(file))
     for name in ("signals", "course"):
-        made.gram(name)
-    return made
+        fleet.gram(name)
+    return fleet
 
 
 @pytest.fixture(scope="module")
 def calibrated(uncalibrated: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("calibrated") / "data"
-    made = fleet_slip.open(shutil.copytree(str(uncalibrated.root), folder))
+    fleet = fleet_slip.open(shutil.copytree(str(uncalibrated.root), folder))
     for name in ("calibration", "delay", "windows"):
-        made.gram(name)
+        fleet.gram(name)
     return folder
 
 
@@ -87,10 +87,12 @@ def test_the_intercept_needs_the_calibration_and_the_columns(
     selection = uncalibrated.cohort("true").select(label="course", model=COLUMNS)
     with pytest.raises(DataError, match="fleet-slip gram --features calibration"):
         uncalibrated.models.publish("too_early", selection)
-    made = fleet_slip.open(shutil.copytree(str(uncalibrated.root), tmp_path / "data"))
-    made.gram("calibration")
+    fleet = fleet_slip.open(shutil.copytree(str(uncalibrated.root), tmp_path / "data"))
+    fleet.gram("calibration")
     with pytest.raises(DataError, match="fleet-slip gram --features windows"):
-        made.models.publish("too_early", made.cohort("true").select(label="course", model=COLUMNS))
+        fleet.models.publish(
+            "too_early", fleet.cohort("true").select(label="course", model=COLUMNS)
+        )
     through = uncalibrated.cohort("true").select(label="course", model=COLUMNS, intercept=False)
     manifest = uncalibrated.models.publish("none", through, force=True).version.manifest
     assert manifest.intercept == 0 and manifest.learned_from and manifest.learned_from.cars == 0
@@ -118,7 +120,7 @@ def test_a_model_without_a_label_is_one_of_the_angle(fleet: Fleet) -> None:
 def test_cars_without_a_log_or_a_label_teach_the_very_same_model(
     fleet: Fleet, tmp_path: Path
 ) -> None:
-    """What they count on board, and nothing else; a drive is told in some kilobytes."""
+    """The sums that cars count on board, and nothing else; a drive has some kilobytes."""
     taught = without_label(fleet)
     counter = build(tmp_path, sets_on_board(CATALOG, taught), "-O0")
     logged = fleet.sql(
@@ -135,10 +137,10 @@ def test_cars_without_a_log_or_a_label_teach_the_very_same_model(
         sent.append(counter.messages(rows.to_arrow_table(), late, START_S + 86_400 * number))
     edge = fleet_slip.open(tmp_path / "edge")
     edge.import_onboard_grams(write_counted(tmp_path / "rows", rows_of_messages(b"".join(sent))))
-    found = without_label(edge)
-    assert found.trained_on.drives_without_log == found.trained_on.drives == len(logged)
-    assert (found.intercept, found.terms) == (taught.intercept, taught.terms)
-    assert found.learned_from == taught.learned_from
+    selection = without_label(edge)
+    assert selection.trained_on.drives_without_log == selection.trained_on.drives == len(logged)
+    assert (selection.intercept, selection.terms) == (taught.intercept, taught.terms)
+    assert selection.learned_from == taught.learned_from
     assert max(map(len, sent)) < 5_000
 
 
@@ -181,27 +183,34 @@ def test_the_same_again_is_nothing_new_and_the_gate_compares_changes(fleet: Flee
 
 def test_columns_are_searched_for(fleet: Fleet) -> None:
     selection = fleet.cohort("true").select(label="course")
-    (found,) = selection.searched
-    assert found is not None and len(selection.winner.model.signals) <= 6
+    (searched,) = selection.searched
+    assert searched is not None and len(selection.winner.model.signals) <= 6
     assert math.isclose(selection.winner.model.pooled.error_mean_deg, 0, abs_tol=1e-9)
     assert selection.model_list == "course"
-    told = selection.without_label
-    assert told is not None and told.noise_deg is not None and told.angle_at_most_deg is not None
+    summary = selection.without_label
+    assert (
+        summary is not None
+        and summary.noise_deg is not None
+        and summary.angle_at_most_deg is not None
+    )
     # The noise of two fixes of 0.03 m/s each, at 15 to 45 m/s.
-    assert 0.05 < told.noise_deg < 0.2 < told.error_deg and told.noise_uncertainty_deg is not None
-    assert 0.02 < told.angle_at_most_deg < told.error_deg / math.sqrt(2)
-    assert told.one_way is None and -0.4 < told.turn_balance < -0.1
+    assert (
+        0.05 < summary.noise_deg < 0.2 < summary.error_deg
+        and summary.noise_uncertainty_deg is not None
+    )
+    assert 0.02 < summary.angle_at_most_deg < summary.error_deg / math.sqrt(2)
+    assert summary.one_way is None and -0.4 < summary.turn_balance < -0.1
 
 
 def test_cars_that_turn_to_one_side_alone_are_told(tmp_path: Path) -> None:
     file = tmp_path / "round.toml"
     file.write_text(CAMPAIGN.replace("laps = 1", ROUND))
-    made = fleet_slip.open(tmp_path / "data")
-    made.simulate(str(file), days=1)
+    fleet = fleet_slip.open(tmp_path / "data")
+    fleet.simulate(str(file), days=1)
     for name in ("signals", "course"):
-        made.gram(name)
-    told = made.cohort("true").select(label="course", model=COLUMNS).without_label
-    assert told is not None and told.one_way == "left" and told.turn_balance > 0.95
+        fleet.gram(name)
+    summary = fleet.cohort("true").select(label="course", model=COLUMNS).without_label
+    assert summary is not None and summary.one_way == "left" and summary.turn_balance > 0.95
 
 
 def test_a_set_without_changes_has_no_course(fleet: Fleet) -> None:

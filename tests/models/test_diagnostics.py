@@ -26,24 +26,26 @@ COEFFICIENTS = (0.1, 0.4, 0.9, 0.2)
 
 def test_figures_are_those_of_the_rows() -> None:
     drives = driven(1, COEFFICIENTS)
-    found = diagnose(cohort_of(drives), INPUTS)
+    diagnosis = diagnose(cohort_of(drives), INPUTS)
     rows = rows_of(drives).astype(float)
     b, rss = dense_fit(rows)
     scales = CATALOG.input_scales
     units = [float(scales[LABEL] / scales[name]) for name in INPUTS]
-    slopes = [estimate.value for estimate in found.naive.estimates[1:]]
+    slopes = [estimate.value for estimate in diagnosis.naive.estimates[1:]]
     np.testing.assert_allclose(slopes, b[1:] * units, rtol=1e-9)
-    assert [e.value for e in found.robust.estimates] == [e.value for e in found.naive.estimates]
+    assert [e.value for e in diagnosis.robust.estimates] == [
+        e.value for e in diagnosis.naive.estimates
+    ]
     deviation = np.sqrt(rss / (len(rows) - 5)) * float(scales[LABEL])
-    assert found.naive.residual_std == pytest.approx(deviation, rel=1e-9)
+    assert diagnosis.naive.residual_std == pytest.approx(deviation, rel=1e-9)
     correlations = np.corrcoef(rows[:, :-1].T)
     inflation = np.diag(np.linalg.inv(correlations))
-    np.testing.assert_allclose([found.inflation[name] for name in INPUTS], inflation, rtol=1e-9)
-    assert found.condition_number == pytest.approx(np.linalg.cond(correlations), rel=1e-9)
-    assert (found.drives, found.fitted.gram.n) == (12, len(rows))
-    document = found.as_dict()
+    np.testing.assert_allclose([diagnosis.inflation[name] for name in INPUTS], inflation, rtol=1e-9)
+    assert diagnosis.condition_number == pytest.approx(np.linalg.cond(correlations), rel=1e-9)
+    assert (diagnosis.drives, diagnosis.fitted.gram.n) == (12, len(rows))
+    document = diagnosis.as_dict()
     assert document["rows"] == len(rows)
-    assert document["design_effect"] == found.evidence.design_effect
+    assert document["design_effect"] == diagnosis.evidence.design_effect
 
 
 def test_cars_are_independent_and_the_drives_of_a_single_car() -> None:
@@ -55,22 +57,28 @@ def test_cars_are_independent_and_the_drives_of_a_single_car() -> None:
     one_car = cohort.drives.set_column(at, "vehicle_id", pa.array(["a"] * len(drives)))
     of_one = replace(cohort, drives=one_car)
     units = [float(CATALOG.input_scales[LABEL] / CATALOG.input_scales[name]) for name in INPUTS]
-    names = [one.drive for one in drives]
+    names = [drive.drive for drive in drives]
     for cluster, groups, read in (("vehicle", owners, cohort), ("drive", names, of_one)):
         parts = [
-            rows_of([d for d, of in zip(drives, groups, strict=True) if of == group])
+            rows_of(
+                [
+                    d
+                    for d, group_of_drive in zip(drives, groups, strict=True)
+                    if group_of_drive == group
+                ]
+            )
             for group in sorted(set(groups))
         ]
         expected, degrees = by_rows(parts)
-        found = diagnose(read, INPUTS)
-        assert found.cluster == cluster
-        slopes = found.robust.estimates[1:]
+        diagnosis = diagnose(read, INPUTS)
+        assert diagnosis.cluster == cluster
+        slopes = diagnosis.robust.estimates[1:]
         errors = [estimate.standard_error for estimate in slopes]
         np.testing.assert_allclose(errors, expected[1:] * units, rtol=1e-7)
         of_t = [estimate.degrees_of_freedom for estimate in slopes]
         np.testing.assert_allclose(of_t, degrees[1:], rtol=1e-6)
-        assert found.robust.degrees_of_freedom == len(set(groups)) - 1
-        assert found.evidence.kind == f"{cluster}s"
+        assert diagnosis.robust.degrees_of_freedom == len(set(groups)) - 1
+        assert diagnosis.evidence.kind == f"{cluster}s"
 
 
 def test_the_campaigns_noise_is_what_the_label_differs_from_the_truth_by(smoke_root: Path) -> None:

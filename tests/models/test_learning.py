@@ -53,16 +53,16 @@ signals = ["ay", "curvature_mean_8", "line", "error_slope"]
 @pytest.fixture(scope="module")
 def own_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Configs of one's own with the set `tiny`, and lists of models of it."""
-    own = tmp_path_factory.mktemp("own")
-    (own / "models").mkdir()
-    (own / "features.toml").write_text(SET)
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "models").mkdir()
+    (folder / "features.toml").write_text(SET)
     for name, text in LISTS.items():
-        (own / "models" / f"{name}.toml").write_text(text)
-    return own
+        (folder / "models" / f"{name}.toml").write_text(text)
+    return folder
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, own_set: Path) -> Path:
+def filled_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, own_set: Path) -> Path:
     """A root with the model `tiny`. Copy it."""
     root = shutil.copytree(smoke_root, tmp_path_factory.mktemp("tiny") / "data")
     published(fleet_slip.open(root, own_set))
@@ -70,8 +70,8 @@ def made(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, own_set: Pa
 
 
 @pytest.fixture
-def fleet(tmp_path: Path, made: Path, own_set: Path) -> Fleet:
-    return fleet_slip.open(shutil.copytree(made, tmp_path / "data"), own_set)
+def fleet(tmp_path: Path, filled_root: Path, own_set: Path) -> Fleet:
+    return fleet_slip.open(shutil.copytree(filled_root, tmp_path / "data"), own_set)
 
 
 def published(fleet: Fleet) -> ModelVersion:
@@ -103,17 +103,19 @@ def test_each_drive_has_the_estimate_of_a_line_that_was_fitted_without_it(fleet:
     )
     folds = {drive: line.fold_of(drive) for drive in rows}
     assert len(set(folds.values())) == len(line.folds) > 2
-    found = grams.to_arrow_table().to_pylist()
-    assert len(found) == len(rows) > 4
-    for gram in found:
-        others = [rows[d] for d in rows if folds[d] != folds[gram["drive_id"]]]
-        training = np.hstack(others)
+    gram_rows = grams.to_arrow_table().to_pylist()
+    assert len(gram_rows) == len(rows) > 4
+    for gram in gram_rows:
+        other_folds = [rows[d] for d in rows if folds[d] != folds[gram["drive_id"]]]
+        training = np.hstack(other_folds)
         training = training[:, np.isfinite(training).all(axis=0)]
         inputs = np.vstack([training[:-1], np.ones(training.shape[1])])
         fitted, *_ = np.linalg.lstsq(inputs.T, training[-1], rcond=None)
-        own = rows[gram["drive_id"]]
-        own = own[:, np.isfinite(own).all(axis=0)]
-        micro_rad = (fitted[:-1] @ own[:-1] + fitted[-1]) * 100  # a count of the label is 0.0001
+        drive_rows = rows[gram["drive_id"]]
+        drive_rows = drive_rows[:, np.isfinite(drive_rows).all(axis=0)]
+        micro_rad = (
+            fitted[:-1] @ drive_rows[:-1] + fitted[-1]
+        ) * 100  # a count of the label is 0.0001
         total = gram["sums"][gram["signals"].split(",").index("line")]
         assert abs(total / gram["row_count"] - micro_rad.mean()) < 0.6
 
@@ -149,8 +151,8 @@ def test_the_line_is_fitted_again_where_a_drive_of_it_is_gone(fleet: Fleet) -> N
     fleet.maintenance.forget(drive=drive)
     after = published(fleet).manifest.trained_on.feature_set
     assert line.digest not in after
-    others = set(fleet.warehouse.stacked_models.digests()) - {line.digest}
-    (digest,) = others
+    new_digests = set(fleet.warehouse.stacked_models.digests()) - {line.digest}
+    (digest,) = new_digests
     fitted = fleet.warehouse.stacked_models.find(digest)
     assert fitted is not None
     assert fitted.drives == line.drives - 1
@@ -172,9 +174,9 @@ def test_counts_of_another_grain_need_another_line(
     """A line of micro-radians is none of ten of them."""
     line = the_line(fleet)
     estimate = '\n[estimates.line]\nscale = 0.00001\ncolumn = "line_rad"\ndescription = "coarser"\n'
-    own = shutil.copytree(own_set, tmp_path / "own")
-    (own / "features.toml").write_text(SET + estimate)
-    fleet = fleet_slip.open(fleet.root, own)
+    configs = shutil.copytree(own_set, tmp_path / "own")
+    (configs / "features.toml").write_text(SET + estimate)
+    fleet = fleet_slip.open(fleet.root, configs)
     with pytest.raises(QuestionError, match=r"counts of 0\.000001 rad"):
         update_grams(fleet.warehouse, feature_set=f"tiny_{line.digest}")
     assert f"tiny_{line.digest}" not in fleet.warehouse.feature_sets()

@@ -29,7 +29,7 @@ def grams() -> list[Gram]:
 
 def drive_grams(seeds: Iterable[int]) -> list[Gram]:
     drives = (drive(np.random.default_rng(seed), gentleness=2.0) for seed in seeds)
-    return [gram_of(counts(one)) for one in drives]
+    return [gram_of(counts(signals)) for signals in drives]
 
 
 @pytest.fixture(scope="module")
@@ -75,13 +75,13 @@ def lie(gram: Gram, gain: int = 1, offset: int = 0, times: int = 1) -> Gram:
 
 
 def forged(grams: Sequence[Gram], how: str) -> Rows:
-    """What liars send on the second day: drives of a day, which is as long as one may be."""
+    """Return the drives of the liars on the second day: a whole day, the most that is accepted."""
     start_s = START_S + DAY_S
     day = 2880
     if how == "gain":
         return [row_of(lie(grams[0], gain=3, times=day), "LIAR", start_s)]
     several = [lie(gram, offset=200, times=day) for gram in grams[:5]]
-    return [row_of(one, f"LIAR{i}", start_s) for i, one in enumerate(several)]
+    return [row_of(drive_gram, f"LIAR{i}", start_s) for i, drive_gram in enumerate(several)]
 
 
 @pytest.mark.parametrize("how", ["gain", "several cars"])

@@ -44,15 +44,15 @@ def test_publishing_again_without_options_is_the_same_model(root: Path, name: st
     assert (again["version"], again["new"]) == (1, False)
 
 
-def test_what_is_asked_for_is_changed_alone_and_said(root: Path) -> None:
+def test_only_given_options_change_the_recipe(root: Path) -> None:
     registry = Registry(LocalFolder(root), CATALOG)
-    kept = recipe_for(registry, "ranked", SelectionRequest())
-    assert (kept.request.ranking, kept.request.folds, kept.request.intercept) == (
+    recipe = recipe_for(registry, "ranked", SelectionRequest())
+    assert (recipe.request.ranking, recipe.request.folds, recipe.request.intercept) == (
         "forward",
         4,
         False,
     )
-    assert kept.cohort == FASTER
+    assert recipe.cohort == FASTER
     wider = recipe_for(registry, "ranked", SelectionRequest(folds=3), "true")
     assert (wider.request.ranking, wider.request.folds, wider.cohort) == ("forward", 3, "true")
     assert FASTER in wider.explanation
@@ -121,8 +121,8 @@ def test_a_version_from_before_that_no_list_chose_needs_to_be_told(tmp_path: Pat
 def test_a_dry_run_publishes_nothing(root: Path) -> None:
     before = answer(root, "models")
     assert answer(root, "publish", "unborn", "--models", "table1", "--dry-run")["publishes"]
-    told = answer(root, "publish", "plain", "--cohort", "day > '2024-05-01'", "--dry-run")
-    assert told["model"] == "plain"
+    document = answer(root, "publish", "plain", "--cohort", "day > '2024-05-01'", "--dry-run")
+    assert document["model"] == "plain"
     assert answer(root, "models") == before
 
 
@@ -150,22 +150,22 @@ def test_publishing_computes_the_columns_of_the_usual_list(smoke_copy: Path) -> 
     for made_of_logs in ("grams", "models"):
         shutil.rmtree(smoke_copy / made_of_logs)
     fleet.gram()
-    made = answer(smoke_copy, "publish", "m")
+    publication = answer(smoke_copy, "publish", "m")
     chosen = fleet.models.get("m").manifest
-    assert (made["new"], chosen.selected_by.model_list) == (True, "estimator")
+    assert (publication["new"], chosen.selected_by.model_list) == (True, "estimator")
 
 
 def test_a_score_leaves_out_what_the_model_was_trained_on(root: Path) -> None:
     first = "day = '2024-05-01'"
     answer(root, "publish", "early", "--cohort", first, "--models", "table1", "--force")
-    whole, new = answer(root, "score", "smoke"), answer(root, "score", "early")
-    assert (whole["drives"], whole["drives_trained"], whole["drives_left_out"]) == (8, 8, 0)
+    full, new = answer(root, "score", "smoke"), answer(root, "score", "early")
+    assert (full["drives"], full["drives_trained"], full["drives_left_out"]) == (8, 8, 0)
     assert (new["drives"], new["drives_trained"], new["drives_left_out"]) == (8, 4, 4)
     old = answer(root, "score", "early", "--cohort", first)
     assert (old["drives"], old["drives_trained"], old["drives_left_out"]) == (4, 4, 0)
-    assert old["rows"] + new["rows"] == whole["rows"]
-    told = done_on(root, "score", "early").stderr
-    assert "left out: 4 drives of 8 that early@1 was trained on" in told
+    assert old["rows"] + new["rows"] == full["rows"]
+    message = done_on(root, "score", "early").stderr
+    assert "left out: 4 drives of 8 that early@1 was trained on" in message
 
 
 def test_the_only_model_need_not_be_named(smoke_root: Path, root: Path) -> None:

@@ -1,4 +1,4 @@
-"""Which signals of a set: orders, searches, and how good the choice is."""
+"""Choice of signals: orders, searches, and the error of the choice."""
 
 from typing import Any, Literal
 
@@ -42,12 +42,12 @@ def list_of(**content: Any) -> ModelList:
 
 
 def test_an_order_is_chosen_from_with_cars_as_independent_units() -> None:
-    found = ordered(driven(1, STRONG_FIRST, drives=30), ranking="forward", criterion="bic")
-    assert found.choice is not None
-    assert found.choice.order[:2] == found.winner.model.signals == ("yaw_rate", "ay")
-    assert found.choice.as_dict()["evidence"] == "vehicles"
-    assert found.winner.reason.startswith("bic keeps 2 of 4 signals of the order by forward")
-    assert [len(model.signals) for model in found.models] == [1, 2, 3, 4]
+    selection = ordered(driven(1, STRONG_FIRST, drives=30), ranking="forward", criterion="bic")
+    assert selection.choice is not None
+    assert selection.choice.order[:2] == selection.winner.model.signals == ("yaw_rate", "ay")
+    assert selection.choice.as_dict()["evidence"] == "vehicles"
+    assert selection.winner.reason.startswith("bic keeps 2 of 4 signals of the order by forward")
+    assert [len(model.signals) for model in selection.models] == [1, 2, 3, 4]
 
 
 def test_the_errors_of_a_choice_are_of_the_choice_repeated_without_the_drives() -> None:
@@ -56,13 +56,13 @@ def test_the_errors_of_a_choice_are_of_the_choice_repeated_without_the_drives() 
     cohort = cohort_of(drives)
     nested = cross_validate_choice(cohort, plan)
     errors, choices = [], set()
-    for number, one in enumerate(drives):
-        rest = [other for other in drives if other is not one]
+    for number, held_out in enumerate(drives):
+        remaining = [other for other in drives if other is not held_out]
         training = cohort.filter(np.arange(len(drives)) != number)
         chosen = select_models(training, plan).winner.model.signals
         at = [INPUTS.index(name) for name in chosen]
-        b, _ = dense_fit(rows_of(rest)[:, [*at, -1]])
-        test = rows_of([one])
+        b, _ = dense_fit(rows_of(remaining)[:, [*at, -1]])
+        test = rows_of([held_out])
         errors.append(b[0] + test[:, at] @ b[1:] - test[:, -1])
         choices.add(chosen)
     assert len(choices) > 1
@@ -82,11 +82,11 @@ def test_a_tolerance_precedes_the_rule_of_the_list(
     cohort = cohort_of(driven(1, (0.00125, 0.4, 0.9, 0.00125), drives=30, noise=3))
     search = Search(method="exchange", max_features=4, rule=rule)
     models = select(cohort, list_of(search=search)).models
-    asked = {
+    options = {
         text: len(choose_by(list_of(search=search, tolerance=text), models).model.signals)
         for text in (around, "0.025deg", "0.0001deg")
     }
-    assert asked == {around: 2, "0.025deg": 2, "0.0001deg": 4}
+    assert options == {around: 2, "0.025deg": 2, "0.0001deg": 4}
     chosen = choose_by(list_of(search=search), models).model
     assert len(chosen.signals) == (4 if rule == "best" else 2)
 
@@ -111,10 +111,10 @@ def test_a_list_searches_among_some_inputs_and_then_all_where_drives_are_enough(
         ),
         Search(name="all", method="exchange", max_features=4, min_drives=9),
     )
-    for drives, found in ((8, ["few 1", "few 2"]), (9, ["few 1", "few 2", *ALL_SIZES])):
+    for drives, names in ((8, ["few 1", "few 2"]), (9, ["few 1", "few 2", *ALL_SIZES])):
         cohort = cohort_of(driven(1, STRONG_FIRST, drives=drives))
         chosen = select(cohort, list_of(search=searches))
-        assert [one.name for one in chosen.models] == found
+        assert [model.name for model in chosen.models] == names
         assert ("all (search)" in chosen.skipped) == (drives < 9)
     assert chosen.searched_winner is not None
     assert set(chosen.winner.model.signals) >= {"ay", "yaw_rate"}
@@ -122,10 +122,12 @@ def test_a_list_searches_among_some_inputs_and_then_all_where_drives_are_enough(
 
 def test_few_drives_allow_few_columns() -> None:
     search = Search(name="few", method="forward", max_features=4, max_features_per_drive=1)
-    for drives, most in ((3, 3), (5, 4)):
+    for drives, max_columns in ((3, 3), (5, 4)):
         cohort = cohort_of(driven(1, STRONG_FIRST, drives=drives))
         chosen = select(cohort, list_of(search=search))
-        assert [one.name for one in chosen.models] == [f"few {n + 1}" for n in range(most)]
+        assert [model.name for model in chosen.models] == [
+            f"few {n + 1}" for n in range(max_columns)
+        ]
 
 
 ALL_SIZES = [f"all {size}" for size in range(1, 5)]
@@ -133,8 +135,8 @@ ALL_SIZES = [f"all {size}" for size in range(1, 5)]
 
 def test_a_signal_that_repeats_another_is_named() -> None:
     drives = driven(6, STRONG_FIRST)
-    for one in drives:
-        one.counts[:, 3] = 2 * one.counts[:, 1]
+    for drive in drives:
+        drive.counts[:, 3] = 2 * drive.counts[:, 1]
     with pytest.raises(DataError, match="steering_wheel"):
         ordered(drives)
     assert np.linalg.matrix_rank(rows_of(drives)[:, :4]) == 3
@@ -148,19 +150,19 @@ def test_figures_are_those_of_leaving_each_out_on_the_rows(by: str) -> None:
     drives = driven(1, (0.5, -0.2, 0.1, 0.3), drives=9)
     cohort = cohort_of(drives)
     key = cohort.drives["drive_id" if by == "drive" else "vehicle_id"].to_pylist()
-    groups = np.repeat(key, [len(one.counts) for one in drives])
-    rows = np.concatenate([one.counts for one in drives]).astype(float)
+    groups = np.repeat(key, [len(drive.counts) for drive in drives])
+    rows = np.concatenate([drive.counts for drive in drives]).astype(float)
     predicted = cross_val_predict(
         LinearRegression(), rows[:, :-1], rows[:, -1], groups=groups, cv=LeaveOneGroupOut()
     )
     selection = select(cohort, list_of(model=(MODEL,), folds={"by": by, "count": EACH}))
-    (found,) = selection.models
-    assert found.fold_names == tuple(sorted(set(key)))
+    (model,) = selection.models
+    assert model.fold_names == tuple(sorted(set(key)))
     assert selection.as_dict()["folds"]["count"] == len(set(key))
     scale = float(SIGNALS[LABEL].scale)
     rmse = float(np.sqrt(np.mean((predicted - rows[:, -1]) ** 2)))
-    assert found.pooled.rmse == pytest.approx(rmse * scale, rel=1e-9)
-    assert found.correlation == pytest.approx(np.corrcoef(predicted, rows[:, -1])[0, 1], rel=1e-9)
+    assert model.pooled.rmse == pytest.approx(rmse * scale, rel=1e-9)
+    assert model.correlation == pytest.approx(np.corrcoef(predicted, rows[:, -1])[0, 1], rel=1e-9)
 
 
 @pytest.mark.parametrize("count", [5, 6, 1000, EACH])

@@ -28,7 +28,9 @@ PROCESSES.set_forkserver_preload(["fleet_slip.api.fleet"])  # once, for all that
 
 def call_at_once(function: Callable[..., object], arguments: Iterable[tuple[Any, ...]]) -> None:
     """Call a function with each of the arguments; an `AssertionError` if one fails or hangs."""
-    processes = [PROCESSES.Process(target=function, args=one, daemon=True) for one in arguments]
+    processes = [
+        PROCESSES.Process(target=function, args=values, daemon=True) for values in arguments
+    ]
     for process in processes:
         process.start()
     for process in processes:
@@ -81,7 +83,7 @@ def test_aliases_move_and_go_back(tmp_path: Path) -> None:
     registry.promote("sideslip", 2, "shadow")
     history = registry.history("sideslip")
     assert history.aliases() == {CHAMPION: 1, "shadow": 2}
-    assert [history.pointed_at(one) for one in (CHAMPION, "shadow", "unknown")] == [1, 2, None]
+    assert [history.pointed_at(alias) for alias in (CHAMPION, "shadow", "unknown")] == [1, 2, None]
     rows = registry.as_table().to_pylist()
     assert [row["aliases"] for row in rows] == ["champion", "shadow", ""]
     assert [row["published_at"] for row in rows] == sorted(row["published_at"] for row in rows)
@@ -138,7 +140,7 @@ def test_writers_at_once_publish_the_same_estimator_once(tmp_path: Path) -> None
         assert [(move.alias, move.version) for move in moves] == [(CHAMPION, 1)]
 
 
-def test_what_was_decided_on_another_champion_is_decided_again(tmp_path: Path) -> None:
+def test_a_decision_about_another_champion_is_repeated(tmp_path: Path) -> None:
     registry = Registry(LocalFolder(tmp_path), CATALOG)
     history = registry.history("sideslip")
     challenger = registry.add(manifest(Fraction(2)), b"")
@@ -181,12 +183,12 @@ FRACTIONS: TypeAdapter[Fraction] = TypeAdapter(ExactFraction)
 
 @given(st.fractions(), st.sampled_from([0, 3990, 4000, 4400, 20000]))
 def test_a_fraction_is_the_same_again(value: Fraction, digits: int) -> None:
-    for one in (value * 10**digits, value / 10**digits - 1):
-        text = FRACTIONS.dump_python(one)
-        assert FRACTIONS.validate_python(text) == one
+    for fraction in (value * 10**digits, value / 10**digits - 1):
+        text = FRACTIONS.dump_python(fraction)
+        assert FRACTIONS.validate_python(text) == fraction
 
 
-def test_what_was_decimal_stays_decimal() -> None:
+def test_decimal_numbers_stay_decimal() -> None:
     assert FRACTIONS.dump_python(Fraction(-3, 4)) == "-3/4"
     largest = 10**MAX_DIGITS - 1
     assert FRACTIONS.dump_python(Fraction(largest)) == f"{largest}/1"
@@ -202,10 +204,10 @@ def test_other_text_is_no_fraction(text: str) -> None:
 def test_hashes_of_drives_are_those_of_versions_of_before() -> None:
     """Computed by the release in which they came."""
     drives = np.array([1, 2], dtype=np.uint64)
-    known = [10430483359262113544, 11180994063705713938]
-    made = TrainedDrives.from_hashes("year", drives)
-    assert made.salted.tolist() == known
-    assert made.content == b"".join(one.to_bytes(8, "big") for one in known)
-    assert TrainedDrives.unpacked("year", made.content).among(drives).all()
+    expected = [10430483359262113544, 11180994063705713938]
+    trained = TrainedDrives.from_hashes("year", drives)
+    assert trained.salted.tolist() == expected
+    assert trained.content == b"".join(number.to_bytes(8, "big") for number in expected)
+    assert TrainedDrives.unpacked("year", trained.content).among(drives).all()
     assert not len(TrainedDrives.from_hashes("year", drives[:0]).salted)
-    assert TrainedDrives.from_hashes("other", drives).salted.tolist() != known
+    assert TrainedDrives.from_hashes("other", drives).salted.tolist() != expected

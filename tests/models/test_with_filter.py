@@ -140,15 +140,15 @@ def test_every_estimate_of_a_group_comes_from_fits_without_it(
     monkeypatch.setattr(filter_column, "identify", record)
     monkeypatch.setattr(measured_evaluation, "identify", record)
 
-    def choose(found: PairedEstimates, kinds: PairedEstimates | None) -> CombinationChoice:
-        pairs.append(found)
-        return choose_combination(found, kinds)
+    def choose(estimates: PairedEstimates, kinds: PairedEstimates | None) -> CombinationChoice:
+        pairs.append(estimates)
+        return choose_combination(estimates, kinds)
 
     monkeypatch.setattr(measured_evaluation, "choose_combination", choose)
     done_on(smoke_copy, "publish", "both", "--models", "table1", "--with-filter", car, "--force")
-    whole, *inner = trained
+    outer, *inner = trained
     assert len(inner) >= len(pairs[0].groups) > 1
-    assert all(names < whole for names in inner)
+    assert all(names < outer for names in inner)
 
 
 def test_inner_groups_never_contain_what_is_held_out() -> None:

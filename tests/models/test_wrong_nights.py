@@ -35,27 +35,31 @@ Change = Callable[[Signals], object]
 
 
 def times(name: str, factor: float) -> Change:
-    return lambda one: one.update({name: factor * one[name]})
+    return lambda signals: signals.update({name: factor * signals[name]})
 
 
 def plus(name: str, offset: float) -> Change:
-    return lambda one: one.update({name: one[name] + offset})
+    return lambda signals: signals.update({name: signals[name] + offset})
 
 
 def late(name: str, ticks: int) -> Change:
-    return lambda one: one.update({name: np.r_[np.full(ticks, one[name][0]), one[name][:-ticks]]})
+    return lambda signals: signals.update(
+        {name: np.r_[np.full(ticks, signals[name][0]), signals[name][:-ticks]]}
+    )
 
 
 def stuck(name: str) -> Change:
-    return lambda one: one.update({name: np.full_like(one[name], one[name][0])})
+    return lambda signals: signals.update({name: np.full_like(signals[name], signals[name][0])})
 
 
 def drifting(name: str, by: float) -> Change:
-    return lambda one: one.update({name: one[name] + np.linspace(0, by, len(one[name]))})
+    return lambda signals: signals.update(
+        {name: signals[name] + np.linspace(0, by, len(signals[name]))}
+    )
 
 
 def exchanged(pairs: Mapping[str, str]) -> Change:
-    return lambda one: one.update({a: one[b] for a, b in pairs.items()})
+    return lambda signals: signals.update({a: signals[b] for a, b in pairs.items()})
 
 
 LEFT_RIGHT = {
@@ -77,11 +81,13 @@ WRONG: Mapping[str, Change] = {
     "ay in g": times("ay", 1 / 9.81),
     "ax and ay exchanged": exchanged({"ax": "ay", "ay": "ax"}),
     "yaw rate stuck": stuck("yaw_rate"),
-    "yaw rate without its sign": lambda one: one.update(yaw_rate=np.abs(one["yaw_rate"])),
+    "yaw rate without its sign": lambda signals_: signals_.update(
+        yaw_rate=np.abs(signals_["yaw_rate"])
+    ),
     "wheels left and right exchanged": exchanged(LEFT_RIGHT),
 }
 USUAL = ("label in rad taken for degrees",)
-"""Of those, what is tried every time, by all ways; the others on long runs, each by one."""
+"""Kinds that every run tests in all ways; long runs test the others, each in one way."""
 WAYS = ("command", "night", "python")
 
 
@@ -94,7 +100,7 @@ def land_day(fleet: Fleet, number: int, rng: np.random.Generator, change: Change
             change(signals)
         largest = {name: 32767 * float(SIGNALS[name].scale) for name in signals}
         clipped = {
-            name: np.clip(one, -largest[name], largest[name]) for name, one in signals.items()
+            name: np.clip(values, -largest[name], largest[name]) for name, values in signals.items()
         }
         drives.append(
             log_rows(
@@ -135,7 +141,8 @@ def error_deg(manifest: Manifest, truth: Gram) -> float:
 
 
 @pytest.mark.parametrize(
-    "kind", [one if one in USUAL else pytest.param(one, marks=pytest.mark.long) for one in WRONG]
+    "kind",
+    [item if item in USUAL else pytest.param(item, marks=pytest.mark.long) for item in WRONG],
 )
 def test_every_way_to_a_champion_leaves_a_wrong_night_out(
     honest: Path, truth: Gram, tmp_path: Path, run_command: RunCommand, kind: str
@@ -148,19 +155,19 @@ def test_every_way_to_a_champion_leaves_a_wrong_night_out(
     update_grams(fleet.warehouse)
 
     ways = WAYS if kind in USUAL else WAYS[list(WRONG).index(kind) % 3 :][:1]
-    for kept in ("new_", ""):
+    for prefix in ("new_", ""):
         code = 7
         if "command" in ways:
-            code = run_command("publish", f"{kept}command", "--models", "table1").exit_code
+            code = run_command("publish", f"{prefix}command", "--models", "table1").exit_code
             assert code in (0, 7)
         if "python" in ways:
             try:
-                fleet.models.publish(f"{kept}python", fleet.cohort().select(models="table1"))
+                fleet.models.publish(f"{prefix}python", fleet.cohort().select(models="table1"))
             except RefusedError:
                 assert code == 7
         if "night" in ways:
-            name = f"{kept}night"
+            name = f"{prefix}night"
             fleet.nightly(landing, "race_car_250lm", name, models="table1", night=NIGHT)
-        found = [fleet.models.get(f"{kept}{way}").manifest for way in ways]
-        assert len({one.trained_on.cohort for one in found}) == 1
-        assert max(error_deg(one, truth) for one in found) < WORST * right
+        manifests = [fleet.models.get(f"{prefix}{way}").manifest for way in ways]
+        assert len({item.trained_on.cohort for item in manifests}) == 1
+        assert max(error_deg(item, truth) for item in manifests) < WORST * right

@@ -75,19 +75,19 @@ def test_with_now_no_byte_below_the_root_names_the_car_not_even_in_older_version
     assert mentions(tmp_path, "gamma")
 
 
-def test_what_a_killed_job_left_goes_at_once_and_files_of_other_cars_stay_for_compact(
+def test_leftovers_of_a_killed_job_are_erased_and_files_of_other_cars_stay(
     tmp_path: Path,
 ) -> None:
     warehouse = fill(tmp_path, "alfa", "beta")
     refused = [{"drive_id": "beta-7"}, {"vehicle_id": "beta"}]  # of the first, the log alone tells
-    left = [warehouse.logs.write_file("left", drive("beta", 7), date(2024, 5, 1))]
+    leftovers = [warehouse.logs.write_file("left", drive("beta", 7), date(2024, 5, 1))]
     for number, row in enumerate(reversed(refused)):
         table = pa.Table.from_pylist([row], schema=warehouse.quarantine.schema)
-        left.append(warehouse.quarantine.write_file(f"left{number}", table))
+        leftovers.append(warehouse.quarantine.write_file(f"left{number}", table))
     warehouse.quarantine.fence()
     other = warehouse.logs.write_file("other", drive("alfa", 7), date(2024, 5, 1))
     assert not forget(warehouse, ErasureSubject("vehicle", "beta"), now=True).pending
-    assert not mentions(tmp_path, "beta"), left
+    assert not mentions(tmp_path, "beta"), leftovers
     os.utime(tmp_path / "logs" / other.path, (0, 0))  # where clocks differ, a job may be writing it
     assert not forget(warehouse, ErasureSubject("vehicle", "beta"), now=True).pending
     assert (tmp_path / "logs" / other.path).exists()
@@ -97,9 +97,7 @@ def test_what_a_killed_job_left_goes_at_once_and_files_of_other_cars_stay_for_co
 
 @pytest.mark.parametrize("old", [True, False])
 @pytest.mark.parametrize("table", ["logs", "grams"])
-def test_where_a_delta_log_was_lost_nothing_is_deleted(
-    tmp_path: Path, table: str, old: bool
-) -> None:
+def test_a_lost_delta_log_prevents_deletion(tmp_path: Path, table: str, old: bool) -> None:
     warehouse = fill(tmp_path, "alfa", "beta")
     shutil.rmtree(tmp_path / table / "_delta_log")
     files = sorted(tmp_path.rglob("*.parquet"))
@@ -123,18 +121,18 @@ def test_the_record_names_nobody_and_can_be_asked(tmp_path: Path) -> None:
         forget(warehouse, ErasureSubject("vehicle", "delta"))
 
 
-def test_whoever_forgets_first_at_the_same_moment_is_found_in_the_record(
+def test_the_record_names_the_first_of_two_erasures_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     erasure_log = ErasureLog(LocalFolder(tmp_path))
-    one, other = (ErasureSubject("vehicle", name) for name in ("alfa", "beta"))
-    erasure_log.begin(one, 1, [])
+    first, other = (ErasureSubject("vehicle", name) for name in ("alfa", "beta"))
+    erasure_log.begin(first, 1, [])
     with monkeypatch.context() as patch:
         patch.setattr(ErasureLog, "entries", lambda _: [])  # as they were a moment ago
         erasure_log.begin(other, 2, ["m@1"])
-    assert [erasure_log.state(subject) for subject in (one, other)] == ["begun"] * 2
+    assert [erasure_log.state(subject) for subject in (first, other)] == ["begun"] * 2
     erasure_log.end(other)
-    assert [erasure_log.state(subject) for subject in (one, other)] == ["begun", "done"]
+    assert [erasure_log.state(subject) for subject in (first, other)] == ["begun", "done"]
     assert erasure_log.models_of(other) == ["m@1"]
 
 
@@ -175,8 +173,8 @@ def test_a_car_all_of_whose_rows_were_refused_goes_too(tmp_path: Path, subject: 
     assert (report.drives, report.rows) == (1, 0)
     assert warehouse.logs.snapshot().files == before.files
     assert not warehouse.quarantine.snapshot().files
-    left = mentions(tmp_path / "data", "secretive") + mentions(tmp_path / "data", "777.125")
-    assert not left
+    remaining = mentions(tmp_path / "data", "secretive") + mentions(tmp_path / "data", "777.125")
+    assert not remaining
     assert not forget(warehouse, chosen).changed
 
 
@@ -231,9 +229,9 @@ def test_a_drive_of_a_future_day_does_not_prove_the_clock(tmp_path: Path) -> Non
 def test_models_are_marked_and_run_trains_again_without_bringing_the_drive_back(
     run_command: RunCommand, smoke_copy: Path
 ) -> None:
-    few = "day = '2024-05-02'"
+    predicate = "day = '2024-05-02'"
     short = ("--models", "table1")
-    run_command("publish", "other", "--cohort", few, *short, "--force")  # of few drives
+    run_command("publish", "other", "--cohort", predicate, *short, "--force")  # of few drives
     report = run_command("forget", "--drive", "smoke-2024-05-01-0001", "--now", "--json").json
     assert report["models"] == ["smoke@1"]
     marks = {
@@ -299,19 +297,19 @@ def test_temporary_files_of_killed_jobs_go_at_any_age_and_those_of_a_run_are_nam
     assert not mentions(tmp_path, "beta")
 
 
-def test_what_cannot_be_read_or_deleted_is_no_success(
+def test_an_unreadable_or_undeletable_file_is_no_success(
     tmp_path: Path, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     warehouse = fill(tmp_path / "data", "alfa", "beta")
     action = warehouse.logs.write_file("left", drive("beta", 7), date(2024, 5, 1))
-    left = tmp_path / "data" / "logs" / action.path
-    left.write_bytes(b"beta, and damaged")
+    leftover = tmp_path / "data" / "logs" / action.path
+    leftover.write_bytes(b"beta, and damaged")
     words = ("forget", "--vehicle", "beta", "--now")
     done = run_command(*words)
     assert done.exit_code == 12
     assert f"logs/{action.path} (unreadable)" in done.stderr
     assert "fleet-slip verify" in done.stderr
-    left.unlink()
+    leftover.unlink()
     action = warehouse.logs.write_file("left", drive("beta", 8), date(2024, 5, 1))
     with monkeypatch.context() as patch:
         patch.setattr(LocalFolder, "remove", lambda *_: False)

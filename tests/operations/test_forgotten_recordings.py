@@ -173,7 +173,7 @@ def test_entries_of_names_as_they_were_typed_bar_that_name_until_it_is_allowed(
 
 
 GONE = ("WVWGONE", "track-gone", "gone.csv", "lap-gone")
-"""What names the car in every column: itself, its track, its file, its drive."""
+"""Names of the car in every column: its own, its track, its file, its drive."""
 STAYS = ("WVWSTAYS", "track-stays", "stays.csv", "lap-stays")
 
 
@@ -200,7 +200,7 @@ def ingest_two_days(root: Path, folder: Path) -> Warehouse:
 
 
 def texts_below(root: Path) -> Iterator[str]:
-    """What stands in each file: its bytes, and decoded its rows with their whole dictionaries."""
+    """Return the content of each file: its bytes, and its decoded rows with their dictionaries."""
     for file in (file for file in root.rglob("*") if file.is_file()):
         yield file.read_bytes().decode("latin-1")
         if file.name.endswith(".parquet") and "_delta_log" not in file.parts:

@@ -43,11 +43,11 @@ def driven(name: str, signals: Signals, car: str = "car-1", day: date = DAY) -> 
     return name, car, day, gram_of(counts(signals))
 
 
-def cohort_of(some: Sequence[Driven]) -> Cohort:
+def cohort_of(drives_: Sequence[Driven]) -> Cohort:
     """Return the cohort of some drives of one vehicle model, as from their logs."""
-    *_, days, grams = zip(*some, strict=True)
-    table = drives(*((car, name, None, TICKS / 100) for name, car, *_ in some))
-    same = {"vehicle_model": ["car"] * len(some), "saturated": [0] * len(some)}
+    *_, days, grams = zip(*drives_, strict=True)
+    table = drives(*((car, name, None, TICKS / 100) for name, car, *_ in drives_))
+    same = {"vehicle_model": ["car"] * len(drives_), "saturated": [0] * len(drives_)}
     for name, values in {"day": [*days], **same}.items():
         table = table.append_column(name, [values])
     return Cohort(
@@ -60,15 +60,15 @@ def cohort_of(some: Sequence[Driven]) -> Cohort:
     )
 
 
-def examine_labels_too(some: Sequence[Driven]) -> QualityReport:
-    cohort = cohort_of(some)
+def examine_labels_too(drives_: Sequence[Driven]) -> QualityReport:
+    cohort = cohort_of(drives_)
     return examine(cohort, find_wrong_labels(cohort))
 
 
 def fleet(change: Callable[[Signals], None]) -> Cohort:
     """Return drives of which the last has a fault."""
-    some, last = sound()
-    return cohort_of([*some, driven("d29", broken(last, change))])
+    signals_of_drives, last = sound()
+    return cohort_of([*signals_of_drives, driven("d29", broken(last, change))])
 
 
 @cache
@@ -76,7 +76,7 @@ def sound() -> tuple[list[Driven], Signals]:
     """Return all drives but the last, and what that would be."""
     rng = np.random.default_rng(5)
     *signals, last = [drive(rng) for _ in range(DRIVES)]
-    return [driven(f"d{i:02d}", one) for i, one in enumerate(signals)], last
+    return [driven(f"d{i:02d}", values) for i, values in enumerate(signals)], last
 
 
 def only_finding(report: QualityReport) -> Fault:
@@ -122,7 +122,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("change", "kind", "signals"), FAULTS)
-def test_what_is_broken_is_named(
+def test_a_broken_sensor_is_named(
     change: Callable[[Signals], None], kind: str, signals: tuple[str, ...]
 ) -> None:
     fault = only_finding(examine(fleet(change)))
@@ -137,10 +137,10 @@ def test_a_label_that_is_reversed_for_one_car_is_found(turned: int) -> None:
         for i in range(turned)
     ]
     findings = examine_labels_too([*sound()[0], *other]).findings
-    assert [(one.drive_id, one.vehicle_id) for one in findings] == [
+    assert [(finding.drive_id, finding.vehicle_id) for finding in findings] == [
         (f"e{i:02d}", "e") for i in range(turned)
     ]
-    assert {(one.fault.kind, one.fault.signals) for one in findings} == {
+    assert {(finding.fault.kind, finding.fault.signals) for finding in findings} == {
         ("reversed", ("sideslip",))
     }
 
@@ -148,12 +148,12 @@ def test_a_label_that_is_reversed_for_one_car_is_found(turned: int) -> None:
 def two_kinds_of_cars(often: Callable[[Signals], None]) -> QualityReport:
     """Examine 60 drives of one car, whose sensors have no offsets, and one each of 30 others."""
     rng = np.random.default_rng(6)
-    some = [driven(f"often-{i:02d}", broken(drive(rng), often), "often") for i in range(60)]
+    cars = [driven(f"often-{i:02d}", broken(drive(rng), often), "often") for i in range(60)]
     for i in range(30):
-        one = broken(drive(rng), add("ay", rng.normal(0, 0.3)))
-        one = broken(one, add("yaw_rate", rng.normal(0, 0.02)))
-        some.append(driven(f"once-{i:02d}", one, f"car-{i:02d}"))
-    return examine(cohort_of(some))
+        signals = broken(drive(rng), add("ay", rng.normal(0, 0.3)))
+        signals = broken(signals, add("yaw_rate", rng.normal(0, 0.02)))
+        cars.append(driven(f"once-{i:02d}", signals, f"car-{i:02d}"))
+    return examine(cohort_of(cars))
 
 
 def test_a_car_that_drives_every_day_does_not_say_what_is_usual() -> None:
@@ -161,7 +161,7 @@ def test_a_car_that_drives_every_day_does_not_say_what_is_usual() -> None:
     assert (report.drives, report.compared, report.findings) == (90, 90, ())
 
 
-def test_what_is_wrong_in_all_drives_of_a_car_shows_beside_other_cars() -> None:
+def test_a_fault_in_all_drives_of_a_car_shows_beside_other_cars() -> None:
     report = two_kinds_of_cars(add("steering_wheel", 0.3))
     (finding,) = report.findings
     assert (finding.drive_id, finding.fault.kind) == ("often-00", "biased")
@@ -205,8 +205,8 @@ def test_the_command_tells_by_its_exit_code(run_command: RunCommand, warehouse: 
     signals = [drive(rng) for _ in range(DRIVES)]
     multiply("ay", -1)(signals[-1])
     rows = [
-        log_rows(f"d{i:02d}", counts(one), saturated=TICKS // 10 if i == 28 else 0)
-        for i, one in enumerate(signals)
+        log_rows(f"d{i:02d}", counts(values), saturated=TICKS // 10 if i == 28 else 0)
+        for i, values in enumerate(signals)
     ]
     land(warehouse, "all", *rows)
     update_grams(warehouse)
@@ -230,18 +230,18 @@ def test_a_heading_and_a_reversed_course_are_found(warehouse: Warehouse) -> None
         signals = with_course(drive(rng, gentleness=4), rng, slip=name != "heading")
         signals["course"] *= -1 if name == "turned" else 1
         fixes = ~np.isnan(signals["course"])
-        whole: dict[str, Any] = {**counts({k: np.nan_to_num(v) for k, v in signals.items()})}
+        columns: dict[str, Any] = {**counts({k: np.nan_to_num(v) for k, v in signals.items()})}
         for extra in ("course", "satellite_speed"):
-            whole[extra] = [
-                v if fix else None for v, fix in zip(whole[extra].tolist(), fixes, strict=True)
+            columns[extra] = [
+                v if fix else None for v, fix in zip(columns[extra].tolist(), fixes, strict=True)
             ]
-        drives[name] = whole
-    land(warehouse, "all", *(log_rows(name, one) for name, one in drives.items()))
+        drives[name] = columns
+    land(warehouse, "all", *(log_rows(name, item) for name, item in drives.items()))
     update_grams(warehouse)
     assert examine_drives(warehouse).findings == ()
     update_grams(warehouse, feature_set="course")
-    found = {one.drive_id: one.fault for one in examine_drives(warehouse).findings}
-    assert {name: (one.kind, one.signals) for name, one in found.items()} == {
+    faults = {item.drive_id: item.fault for item in examine_drives(warehouse).findings}
+    assert {name: (item.kind, item.signals) for name, item in faults.items()} == {
         "heading": ("no slip", ("course",)),
         "turned": ("reversed", ("course",)),
     }
@@ -250,29 +250,29 @@ def test_a_heading_and_a_reversed_course_are_found(warehouse: Warehouse) -> None
 def test_steering_of_cars_with_biased_sensors_is_not_called_swapped() -> None:
     """The mean difference of the wheels is some hundredths of a degree; sensors are off by more."""
     rng = np.random.default_rng(8)
-    some = []
+    cars = []
     for number in range(DRIVES):
         signals = drive(rng)
         signals["steer_fl"] = 0.4 * signals["steer_fl"] + rng.normal(0, 0.005)
         signals["steer_fr"] = 0.4 * signals["steer_fr"]
-        some.append(driven(f"d{number}", signals, f"car-{number}"))
-    assert examine_labels_too(some).findings == ()
+        cars.append(driven(f"d{number}", signals, f"car-{number}"))
+    assert examine_labels_too(cars).findings == ()
 
 
 BEGAN = datetime(2024, 5, 31, 8, tzinfo=UTC)
 
 
-def drives(*told: tuple[str, str, float | None, float]) -> pa.Table:
+def drives(*facts: tuple[str, str, float | None, float]) -> pa.Table:
     """Drives by car, name, begin and duration in s."""
-    at = [None if start is None else BEGAN + timedelta(seconds=start) for _, _, start, _ in told]
+    at = [None if start is None else BEGAN + timedelta(seconds=start) for _, _, start, _ in facts]
     return pa.table(
         {
-            "vehicle_id": [car for car, *_ in told],
-            "drive_id": [name for _, name, *_ in told],
+            "vehicle_id": [car for car, *_ in facts],
+            "drive_id": [name for _, name, *_ in facts],
             "started_at": pa.array(at, pa.timestamp("us", tz="UTC")),
-            "duration_s": [lasted for *_, lasted in told],
-            "source": ["measured"] * len(told),
-            "n": [0] * len(told),
+            "duration_s": [lasted for *_, lasted in facts],
+            "source": ["measured"] * len(facts),
+            "n": [0] * len(facts),
         }
     )
 
@@ -288,7 +288,7 @@ def received(car: str, start_s: float, rows: int) -> pa.Table:
 
 
 def test_the_later_of_two_drives_at_once_is_named() -> None:
-    found = find_repeated(
+    repeated = find_repeated(
         drives(
             ("car", "long", 0, 1000),
             ("car", "within", 100, 50),
@@ -298,15 +298,15 @@ def test_the_later_of_two_drives_at_once_is_named() -> None:
             ("car", "undated", None, 1000),
         )
     )
-    assert {name: fault.figure for name, fault in found.items()} == {
+    assert {name: fault.figure for name, fault in repeated.items()} == {
         "within": "50 s overlap with long",
         "beyond": "50 s overlap with long",
     }
-    assert {fault.kind for fault in found.values()} == {"repeated"}
+    assert {fault.kind for fault in repeated.values()} == {"repeated"}
 
 
-def test_of_a_drive_without_a_log_and_a_log_at_once_that_without_is_named() -> None:
-    found = find_repeated(
+def test_a_drive_without_a_log_is_named_beside_its_log() -> None:
+    repeated = find_repeated(
         pa.concat_tables(
             [
                 received("car", 0, 4000),
@@ -320,7 +320,7 @@ def test_of_a_drive_without_a_log_and_a_log_at_once_that_without_is_named() -> N
             ]
         )
     )
-    assert {name: fault.figure for name, fault in found.items()} == {
+    assert {name: fault.figure for name, fault in repeated.items()} == {
         "car-20240531T080000Z": "40 s overlap with resampled",
         "car-20240531T080100Z": "40 s overlap with next",
         "car-20240531T080235Z": "5 s overlap with car-20240531T080230Z",
@@ -331,11 +331,11 @@ CARS, DAYS = 12, 3
 NIGHT = DAY + timedelta(days=DAYS - 1)
 
 
-def three_days(change: Callable[[Signals], None], every: int = 1) -> list[Driven]:
+def three_days(change: Callable[[Signals], None], step: int = 1) -> list[Driven]:
     """Return three days of drives of as many cars; on the last, every n-th label is wrong."""
     before, last = two_days()
     return before + of_day(
-        NIGHT, [s if i % every else broken(s, change) for i, s in enumerate(last)]
+        NIGHT, [s if i % step else broken(s, change) for i, s in enumerate(last)]
     )
 
 
@@ -347,15 +347,15 @@ def two_days() -> tuple[list[Driven], list[Signals]]:
     before: list[Driven] = []
     for number in range(DAYS):
         signals = [drive(rng, gentleness=2) for _ in factors]
-        for one, factor in zip(signals, factors, strict=True):
-            one["sideslip"] *= factor
+        for values, factor in zip(signals, factors, strict=True):
+            values["sideslip"] *= factor
         if number < DAYS - 1:
             before += of_day(DAY + timedelta(days=number), signals)
     return before, signals
 
 
 def of_day(day: date, signals: list[Signals]) -> list[Driven]:
-    return [driven(f"{day}-{i:02d}", one, f"car-{i}", day) for i, one in enumerate(signals)]
+    return [driven(f"{day}-{i:02d}", values, f"car-{i}", day) for i, values in enumerate(signals)]
 
 
 def multiplied(factor: float) -> Callable[[Signals], None]:
@@ -372,10 +372,10 @@ def iced(signals: Signals) -> None:
     shifted(0.1)(signals)
 
 
-def found(some: Sequence[Driven]) -> tuple[set[str], set[str], int]:
+def kinds_and_days(cars: Sequence[Driven]) -> tuple[set[str], set[str], int]:
     """Return the kinds, days and number of wrong labels, whatever peers tell of the drives."""
-    faults = find_wrong_labels(cohort_of(some))
-    return {one.kind for one in faults.values()}, {name[:10] for name in faults}, len(faults)
+    faults = find_wrong_labels(cohort_of(cars))
+    return {fault.kind for fault in faults.values()}, {name[:10] for name in faults}, len(faults)
 
 
 @pytest.mark.parametrize(
@@ -390,13 +390,13 @@ def found(some: Sequence[Driven]) -> tuple[set[str], set[str], int]:
 def test_a_day_on_which_all_labels_are_wrong_is_found(
     change: Callable[[Signals], None], kind: str
 ) -> None:
-    assert found(three_days(change)) == ({kind}, {str(NIGHT)}, CARS)
+    assert kinds_and_days(three_days(change)) == ({kind}, {str(NIGHT)}, CARS)
 
 
 @pytest.mark.parametrize("change", [multiplied(1 / 57.3), shifted(2)])
 def test_a_third_of_a_days_labels_is_found(change: Callable[[Signals], None]) -> None:
-    assert found(three_days(change, every=3))[1:] == ({str(NIGHT)}, CARS / 3)
+    assert kinds_and_days(three_days(change, step=3))[1:] == ({str(NIGHT)}, CARS / 3)
 
 
-def test_what_roads_and_loads_change_is_no_fault() -> None:
-    assert found(three_days(iced)) == (set(), set(), 0)
+def test_effects_of_roads_and_loads_are_no_faults() -> None:
+    assert kinds_and_days(three_days(iced)) == (set(), set(), 0)

@@ -174,11 +174,11 @@ def test_a_simulation_under_way_does_not_bring_a_forgotten_drive_back(
     warehouse = Warehouse(LocalFolder(tmp_path))
     campaign = load_campaign("smoke", SHIPPED_CONFIGS)
     batches = campaign.batches(campaign.days()[0])
-    gone = batches[0].drives[0]
+    erased = batches[0].drives[0]
     erasure_log = ErasureLog(warehouse.root)
 
     def forget_meanwhile() -> None:
-        erasure_log.begin(ErasureSubject("drive", gone.drive_id), 1, [])
+        erasure_log.begin(ErasureSubject("drive", erased.drive_id), 1, [])
         warehouse.logs.fence()
 
     just_before_its_commit(monkeypatch, forget_meanwhile)
@@ -188,8 +188,8 @@ def test_a_simulation_under_way_does_not_bring_a_forgotten_drive_back(
     drives = {spec.drive_id for batch in batches for spec in batch.drives}
     assert (report.drives, report.drives_forgotten) == (len(drives) - 1, 1)
     assert not again.changed
-    found = ask(warehouse.root, "SELECT DISTINCT drive_id FROM log")
-    assert {row[0] for row in found} == drives - {gone.drive_id}
+    rows = ask(warehouse.root, "SELECT DISTINCT drive_id FROM log")
+    assert {row[0] for row in rows} == drives - {erased.drive_id}
     assert len(list(tmp_path.glob("logs/day=*/*.parquet"))) == len(warehouse.logs.snapshot().files)
 
 
@@ -234,8 +234,8 @@ def test_vacuum_does_not_remove_what_took_the_place_of_a_leftover(
         os.utime(path, (0, 0))
     listed = find_expired(warehouse, 1)
     assert ingest_file(warehouse, file, mapping).new
-    for one in listed:
-        one.folder.remove(one)
+    for candidate in listed:
+        candidate.folder.remove(candidate)
     assert listed
     assert not verify(warehouse).damage
 
@@ -282,9 +282,9 @@ def test_the_command_says_what_may_be_left_and_finishes_when_it_is_repeated(
     half = path_of(warehouse.logs.folder) / "day=2024-05-01" / ".tmp-half"
     half.write_bytes(b"beta, half a file")
     with recording(warehouse.root, "ingest", ["ingest"]):
-        told = run_command("forget", "--vehicle", "beta", "--now")
-        assert told.exit_code == 12
-        assert "2 jobs or files may still hold its rows" in told.stderr
+        result = run_command("forget", "--vehicle", "beta", "--now")
+        assert result.exit_code == 12
+        assert "2 jobs or files may still hold its rows" in result.stderr
     assert cars_in(warehouse, "log") == {"alfa"}
     os.utime(half, (0, 0))
     done = run_command("forget", "--vehicle", "beta", "--now", "--json")
@@ -316,13 +316,13 @@ def laps(tmp_path: Path) -> Fleet:
     return fleet
 
 
-def test_what_is_forgotten_while_it_is_replaced_is_not_doubled(
+def test_a_drive_erased_during_its_replacement_is_not_doubled(
     laps: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     just_before_its_commit(monkeypatch, lambda: forget_all(laps))
     laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
-    found = laps.sql("SELECT drive_name, count(DISTINCT drive_id) FROM log GROUP BY ALL").fetchall()
-    assert all(many == 1 for _, many in found)
+    rows = laps.sql("SELECT drive_name, count(DISTINCT drive_id) FROM log GROUP BY ALL").fetchall()
+    assert all(many == 1 for _, many in rows)
     assert not laps.maintenance.verify(full=True).damage
 
 

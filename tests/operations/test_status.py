@@ -28,14 +28,14 @@ def test_freshness_backlog_and_age(warehouse: Warehouse) -> None:
     land(warehouse, "a", log_rows("a", random_counts(np.random.default_rng(1), 50)))
     update_grams(warehouse)
     land(warehouse, "b", log_rows("b", random_counts(np.random.default_rng(2), 70)))
-    found = status_of(warehouse, max_age_hours=1)
-    assert (found.newest_day, found.tables["logs"].rows, found.tables["grams"].rows) == (
+    status = status_of(warehouse, max_age_hours=1)
+    assert (status.newest_day, status.tables["logs"].rows, status.tables["grams"].rows) == (
         DAY,
         120,
         1,
     )
-    assert (found.backlog_files, found.backlog_rows) == (1, 70)
-    assert found.problems == ()
+    assert (status.backlog_files, status.backlog_rows) == (1, 70)
+    assert status.problems == ()
     later = status_of(warehouse, 1, now=datetime.now(UTC) + timedelta(hours=3))
     assert [text.partition(" for ")[0] for text in later.problems] == [
         "no data has been committed",
@@ -64,7 +64,7 @@ def fail(warehouse: Warehouse, error: FleetSlipError, *arguments: str) -> None:
 
 
 @pytest.mark.parametrize("mistake", [UsageError, ExtraError])
-def test_what_a_person_mistyped_or_was_refused_is_no_failure_of_the_night(
+def test_wrong_usage_and_refusals_are_no_failures_of_the_night(
     warehouse: Warehouse, mistake: type[FleetSlipError]
 ) -> None:
     path_of(warehouse.root).mkdir()
@@ -133,9 +133,9 @@ def test_a_changed_line_of_the_history_is_a_problem_and_all_else_is_told(
         pass
     (history,) = (path_of(warehouse.root) / "runs").iterdir()
     history.write_text(history.read_text().replace('"done"', '"gone"'))
-    found = status_of(warehouse)
-    assert found.problems == (f"runs/{history.name}: line 4 was changed or torn",)
-    assert (found.last_runs, found.tables["logs"].rows) == ((), 50)
+    status = status_of(warehouse)
+    assert status.problems == (f"runs/{history.name}: line 4 was changed or torn",)
+    assert (status.last_runs, status.tables["logs"].rows) == ((), 50)
 
 
 def test_the_command_tells_a_monitor(run_command: RunCommand, tmp_path: Path) -> None:
@@ -155,13 +155,13 @@ def test_the_command_tells_a_monitor(run_command: RunCommand, tmp_path: Path) ->
     assert "last runs" in bad.stdout
 
 
-def test_what_is_unfit_is_said(warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unfit_folder_is_reported(warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch) -> None:
     land(warehouse, "a", log_rows("a", random_counts(np.random.default_rng(1), 50)))
     root = path_of(warehouse.root)
     before = sorted(root.rglob("*"))
     monkeypatch.setattr(LocalFolder, "free_bytes", lambda self: None)
     assert status_of(warehouse).problems == ()
     assert sorted(root.rglob("*")) == before
-    monkeypatch.setattr(LocalFolder, "create", lambda *given: True)
+    monkeypatch.setattr(LocalFolder, "create", lambda *arguments: True)
     (store,) = status_of(warehouse).problems
     assert "creates files twice" in store

@@ -102,8 +102,8 @@ def test_every_flipped_bit_is_found(filled: Warehouse) -> None:
         bits = {file: rng.randrange(file.stat().st_size * 8) for file in files}
         for file, bit in bits.items():
             flip(file, bit)
-        found = {finding.path for finding in verify(filled).damage}
-        assert found >= {str(file.relative_to(path_of(filled.root))) for file in files}, bits
+        damaged = {finding.path for finding in verify(filled).damage}
+        assert damaged >= {str(file.relative_to(path_of(filled.root))) for file in files}, bits
         for file, bit in bits.items():
             flip(file, bit)
     assert not verify(filled).damage
@@ -186,20 +186,20 @@ def test_an_unknown_log_file_is_told_and_never_deleted(filled: Warehouse) -> Non
 def test_a_log_file_lost_with_its_gram_rows_is_told_and_the_rest_rebuilt(
     filled: Warehouse, run_command: RunCommand
 ) -> None:
-    lost, *others = filled.logs.snapshot().paths
-    assert others
+    lost, *remaining = filled.logs.snapshot().paths
+    assert remaining
     content = Path(lost).read_bytes()
     Path(lost).unlink()
     for gram in filled.grams.snapshot().paths:
         Path(gram).unlink()
-    told = run_command("verify", "--repair", "--json")
-    assert told.exit_code == 9
-    (left,) = told.json["damage"]
-    assert left["path"] == str(Path(lost).relative_to(path_of(filled.root)))
-    assert left["problem"].endswith("rows)")
+    repair = run_command("verify", "--repair", "--json")
+    assert repair.exit_code == 9
+    (damage,) = repair.json["damage"]
+    assert damage["path"] == str(Path(lost).relative_to(path_of(filled.root)))
+    assert damage["problem"].endswith("rows)")
     rows = [filled.grams.read(f.path, ["file"]) for f in filled.grams.snapshot().files]
     assert {name for part in rows for name in part["file"].to_pylist()} == {
-        str(Path(other).relative_to(path_of(filled.logs.folder))) for other in others
+        str(Path(other).relative_to(path_of(filled.logs.folder))) for other in remaining
     }
     Path(lost).write_bytes(content)
     assert run_command("verify", "--repair").exit_code == 0
@@ -308,11 +308,11 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     def patch(module: Any, name: str, act: Callable[[], Any], *, once: bool = True) -> None:
         real = getattr(module, name)
 
-        def overtaken(*given: Any, **named: Any) -> Any:
+        def overtaken(*arguments: Any, **named: Any) -> Any:
             if once:
                 monkeypatch.setattr(module, name, real)
             act()
-            return real(*given, **named)
+            return real(*arguments, **named)
 
         monkeypatch.setattr(module, name, overtaken)
 
@@ -340,15 +340,15 @@ def test_a_verification_beside_a_job_that_takes_files_away_finds_no_damage(
 def test_damage_is_damage_beside_other_jobs_too(
     three: Warehouse, meanwhile: Callable[..., None]
 ) -> None:
-    gone, *_ = three.logs.snapshot().files
-    (path_of(three.logs.folder) / gone.path).unlink()
+    removed, *_ = three.logs.snapshot().files
+    (path_of(three.logs.folder) / removed.path).unlink()
     rng = np.random.default_rng(1)
     meanwhile(
         verification,
         "wide_grams",
         lambda: land(three, "more", log_rows("x", random_counts(rng, 9))),
     )
-    with pytest.raises(StorageError, match=gone.path.rpartition("/")[2]):
+    with pytest.raises(StorageError, match=removed.path.rpartition("/")[2]):
         check_grams(three, 3)
     assert {finding.kind for finding in verify(three).damage} >= {"file"}
 

@@ -28,7 +28,7 @@ SIGNED = ("ax", "ay", "yaw_rate", "steering_wheel", "sideslip")
 
 
 def kinds(car: Car) -> set[tuple[str, tuple[str, ...]]]:
-    return {(one.kind, one.signals) for one in check_plausibility(SIGNALS, car)}
+    return {(fault.kind, fault.signals) for fault in check_plausibility(SIGNALS, car)}
 
 
 @pytest.mark.parametrize("least_mps", [2.5, 8.0, 20.0])
@@ -65,7 +65,7 @@ WRONG: list[tuple[Change, str, tuple[str, ...]]] = [
 
 
 @pytest.mark.parametrize(("change", "kind", "signals"), WRONG)
-def test_what_is_wrong_is_named_and_nothing_else(
+def test_only_the_wrong_signals_are_named(
     change: Change, kind: str, signals: tuple[str, ...]
 ) -> None:
     car = a_car(least_mps=2.5)
@@ -86,19 +86,19 @@ def test_tyres_at_their_limit_tell_nothing_of_the_labels_sign() -> None:
     assert ("reversed", ("sideslip",)) not in kinds({**car, "sideslip": at_limit})
 
 
-def test_of_wheels_and_axes_that_contradict_the_fewest_are_at_fault() -> None:
+def test_the_smaller_group_of_contradicting_signals_is_at_fault() -> None:
     car, wheels = a_car(), [("wheel_fl", "wheel_fr"), ("wheel_rl", "wheel_rr")]
     exchanged = {a: car[b] for pair in wheels for a, b in (pair, pair[::-1])}
-    found = check_plausibility(SIGNALS, {**car, **exchanged})
+    faults = check_plausibility(SIGNALS, {**car, **exchanged})
     axes = ("ay", "yaw_rate", "steering_wheel", "sideslip")
-    assert [(fault.kind, fault.signals) for fault in found] == [("reversed", axes)]
-    assert "z-down (SAE J670)" in found[0].figure
-    assert "unless left and right are swapped" in found[0].figure
+    assert [(fault.kind, fault.signals) for fault in faults] == [("reversed", axes)]
+    assert "z-down (SAE J670)" in faults[0].figure
+    assert "unless left and right are swapped" in faults[0].figure
     of_iso = check_plausibility(SIGNALS, {**car, **exchanged, "sideslip": -car["sideslip"]})
     assert [fault.signals for fault in of_iso] == [axes[:3]]
-    few = {**car, "ay": -car["ay"], "yaw_rate": -car["yaw_rate"]}
-    del few["steering_wheel"]
-    assert ("reversed", ("ay", "yaw_rate")) in kinds(few)
+    two_reversed = {**car, "ay": -car["ay"], "yaw_rate": -car["yaw_rate"]}
+    del two_reversed["steering_wheel"]
+    assert ("reversed", ("ay", "yaw_rate")) in kinds(two_reversed)
 
 
 @pytest.mark.parametrize(
@@ -106,8 +106,8 @@ def test_of_wheels_and_axes_that_contradict_the_fewest_are_at_fault() -> None:
 )
 def test_a_unit_that_lies(name: str, factor: float) -> None:
     car = a_car()
-    found = check_plausibility(SIGNALS, {**car, name: factor * car[name]})
-    assert any(name in one.signals for one in found if one.kind == "scaled")
+    faults = check_plausibility(SIGNALS, {**car, name: factor * car[name]})
+    assert any(name in fault.signals for fault in faults if fault.kind == "scaled")
 
 
 STEPS = {"ax": 0.08, "ay": 0.08, "yaw_rate": 0.005, "steering_wheel": 0.026, "sideslip": 0.002}
@@ -132,8 +132,8 @@ def test_signals_as_buses_send_them_are_above_suspicion(held: int, least_mps: fl
 def test_too_little_raises_no_more_than_what_is_plain(
     change: Callable[[FloatArray], FloatArray],
 ) -> None:
-    found = kinds({name: change(values) for name, values in a_car().items()})
-    assert {kind for kind, _ in found} <= {"stuck", "absent"}
+    kinds_ = kinds({name: change(values) for name, values in a_car().items()})
+    assert {kind for kind, _ in kinds_} <= {"stuck", "absent"}
 
 
 MAPPING = """name = "car"
@@ -185,13 +185,13 @@ def test_a_spin_swaps_no_axles() -> None:
 def test_one_angle_of_the_road_wheels_and_a_speed_of_the_bus_are_looked_at() -> None:
     car = a_car()
     speed = np.mean([car[name] for name in WHEELS], axis=0) * RADIUS_M
-    whole = {**car, "steer": car["steering_wheel"] / 15, "vehicle_speed": speed}
-    assert kinds(whole) == set()
-    reversed_ = {**whole, **dict.fromkeys(("steer", "steer_fl", "steer_fr"), -whole["steer"])}
+    signals = {**car, "steer": car["steering_wheel"] / 15, "vehicle_speed": speed}
+    assert kinds(signals) == set()
+    reversed_ = {**signals, **dict.fromkeys(("steer", "steer_fl", "steer_fr"), -signals["steer"])}
     del reversed_["steering_wheel"]
     assert kinds(reversed_) == {("reversed", ("steer",))}
-    assert ("scaled", ("vehicle_speed",)) in kinds({**whole, "vehicle_speed": 3.6 * speed})
-    slow = {**whole, "steer": 57.3 * whole["steer"]}
+    assert ("scaled", ("vehicle_speed",)) in kinds({**signals, "vehicle_speed": 3.6 * speed})
+    slow = {**signals, "steer": 57.3 * signals["steer"]}
     assert ("scaled", ("steering_wheel", "steer")) in kinds(slow)
 
 
@@ -202,10 +202,10 @@ def test_a_unit_that_lies_so_much_that_rows_are_refused_is_told(tmp_path: Path) 
     ended = run_on(tmp_path / "root", *command)
     assert ended.exit_code == AlarmError.exit_code  # most rows are refused
     (report,) = ended.json
-    (found,) = report["suspicions"]
-    assert (found["kind"], found["signals"]) == ("scaled", ["yaw_rate"])
+    (suspicion,) = report["suspicions"]
+    assert (suspicion["kind"], suspicion["signals"]) == ("scaled", ["yaw_rate"])
     refused = report["quarantined"]["out_of_range"]
-    assert found["figure"] == f"{refused:,} of 6,000 rows were refused: out_of_range"
+    assert suspicion["figure"] == f"{refused:,} of 6,000 rows were refused: out_of_range"
     with pytest.raises(AlarmError, match="1 suspicion, see above"):
         call(tmp_path / "other", *command, "--dry-run")
 
@@ -213,10 +213,10 @@ def test_a_unit_that_lies_so_much_that_rows_are_refused_is_told(tmp_path: Path) 
 def test_few_refused_rows_are_no_suspicion() -> None:
     refused = {("ax", "out_of_range"): 100, ("ay", "not_a_number"): 101, ("vx", "new"): 500}
     reasons = {reason: count for (_, reason), count in refused.items()}
-    found = [(one.kind, one.signals) for one in find_refusals(refused, 1000, reasons)]
-    assert found == [("texts", ("ay",)), ("values", ("vx",))]
-    few = {("ax", "out_of_range"): 60, ("ay", "out_of_range"): 60}
-    (together,) = find_refusals(few, 1000, {"out_of_range": 120})
+    faults = [(fault.kind, fault.signals) for fault in find_refusals(refused, 1000, reasons)]
+    assert faults == [("texts", ("ay",)), ("values", ("vx",))]
+    small_counts = {("ax", "out_of_range"): 60, ("ay", "out_of_range"): 60}
+    (together,) = find_refusals(small_counts, 1000, {"out_of_range": 120})
     assert together.figure == "120 of 1,000 rows were refused, 120 of them: out_of_range"
     assert not list(find_refusals({("ax", "out_of_range"): 10}, 12, {"out_of_range": 10}))
     for reason, hint in (("time_duplicate", True), ("time_backwards", True), ("not_a_time", False)):
@@ -237,12 +237,14 @@ def test_ingest_says_once_what_looks_wrong_in_files_that_land_together(tmp_path:
     words = ("ingest", str(logs), "--mapping", mapping)
     done = run_on(tmp_path / "root", *words, "--json")
     assert done.exit_code == AlarmError.exit_code
-    found = {Path(one["file"]).name: one["suspicions"] for one in done.json}
-    assert [(one["kind"], one["signals"]) for one in found["car.csv"]] == [("reversed", ["ay"])]
-    assert found["short.csv"] == [] and all(one["new"] for one in done.json)
+    suspicions = {Path(entry["file"]).name: entry["suspicions"] for entry in done.json}
+    assert [(entry["kind"], entry["signals"]) for entry in suspicions["car.csv"]] == [
+        ("reversed", ["ay"])
+    ]
+    assert suspicions["short.csv"] == [] and all(entry["new"] for entry in done.json)
     assert "Its rows are stored." in done.stderr
-    (told,) = [line for line in done.stderr.splitlines() if "looks wrong: reversed ay?" in line]
-    assert told.startswith(file) and told.endswith("Write negate = true.")
+    (message,) = [line for line in done.stderr.splitlines() if "looks wrong: reversed ay?" in line]
+    assert message.startswith(file) and message.endswith("Write negate = true.")
     assert json.loads(call(tmp_path / "root", *words, "--json")) == []
     with pytest.raises(AlarmError, match="1 suspicion, see above"):
         call(tmp_path / "root", *words, "--dry-run")
@@ -263,13 +265,15 @@ def test_rows_that_are_refused_for_their_time_call_for_attention(tmp_path: Path)
 def test_a_magnitude_without_its_sign_is_told() -> None:
     car = a_car() | {"yaw_rate": np.abs(a_car()["yaw_rate"])}
     long = {name: np.tile(values, 2) for name, values in car.items()}
-    found = {
-        one.signals: one.figure
-        for one in check_plausibility(SIGNALS, long)
-        if one.kind == "magnitude"
+    faults = {
+        fault.signals: fault.figure
+        for fault in check_plausibility(SIGNALS, long)
+        if fault.kind == "magnitude"
     }
-    assert found == {("yaw_rate",): "it is never negative in 2 min"}
-    assert not [one for one in check_plausibility(SIGNALS, a_car()) if one.kind == "magnitude"]
+    assert faults == {("yaw_rate",): "it is never negative in 2 min"}
+    assert not [
+        fault for fault in check_plausibility(SIGNALS, a_car()) if fault.kind == "magnitude"
+    ]
 
 
 def test_a_car_on_an_oval_has_its_sign() -> None:
@@ -315,10 +319,10 @@ def test_a_column_of_cars_that_no_mapping_uses_is_told(tmp_path: Path) -> None:
     """Cars that drive behind one another do as one car does: a column tells them apart."""
     first, second = (cars(1)[0].with_columns(vehicle=pl.lit(name)) for name in ("A", "B"))
     rows = pl.concat([first, second.with_columns(pl.col("t") + 0.005)]).sort("t")
-    (found,) = said_of(rows, tmp_path)
-    assert (found.kind, found.signals) == ("cars", ("vehicle",))
-    assert str(found).startswith("several cars in vehicle? it has 2 values")
-    assert 'vehicle_id = { column = "vehicle" }' in found.remedy
+    (suspicion,) = said_of(rows, tmp_path)
+    assert (suspicion.kind, suspicion.signals) == ("cars", ("vehicle",))
+    assert str(suspicion).startswith("several cars in vehicle? it has 2 values")
+    assert 'vehicle_id = { column = "vehicle" }' in suspicion.remedy
     assert said_of(rows, tmp_path, where=[{"column": "vehicle", "one_of": ["A"]}]) == []
     assert said_of(first, tmp_path) == []
 
@@ -329,8 +333,11 @@ def test_trips_that_follow_one_another_are_drives_and_trips_in_turns_are_not(
     first, second = (cars(1)[0].with_columns(trip=pl.lit(i)) for i in (1, 2))
     assert said_of(pl.concat([first, second.with_columns(pl.col("t") + 100)]), tmp_path) == []
     at_once = second.with_columns(pl.col("t") + 60)  # nothing ends the first
-    (found,) = said_of(pl.concat([first, at_once]), tmp_path)
-    assert (found.signals, found.remedy) == (("trip",), 'Write column = "trip" under [drive].')
+    (suspicion,) = said_of(pl.concat([first, at_once]), tmp_path)
+    assert (suspicion.signals, suspicion.remedy) == (
+        ("trip",),
+        'Write column = "trip" under [drive].',
+    )
 
 
 def test_a_car_is_not_under_way_twice(tmp_path: Path) -> None:
@@ -339,6 +346,6 @@ def test_a_car_is_not_under_way_twice(tmp_path: Path) -> None:
         microseconds=(pl.col("t") * 1e6).cast(pl.Int64)
     )
     both = pl.concat(f.with_columns(since.alias("t")).drop("vehicle", "trip") for f in cars(2))
-    (found,) = said_of(both, tmp_path, time={"unit": None})
-    assert str(found).startswith("repeated time? drives of one car overlap in time (1 time")
+    (suspicion,) = said_of(both, tmp_path, time={"unit": None})
+    assert str(suspicion).startswith("repeated time? drives of one car overlap in time (1 time")
     assert said_of(both.head(6000), tmp_path, time={"unit": None}) == []

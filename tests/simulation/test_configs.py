@@ -42,8 +42,8 @@ def segment(*curvature: float, length_m: float = 9.0) -> str:
 def changed(name: str, old: str, new: str) -> str:
     """Return a shipped config with its last `old` replaced."""
     text = SHIPPED_CONFIGS.find(*name.split("/")).read_text(encoding="utf-8")
-    before, found, after = text.rpartition(old)
-    assert found, f"{name} has no {old}"
+    before, key, after = text.rpartition(old)
+    assert key, f"{name} has no {old}"
     return before + new + after
 
 
@@ -122,19 +122,19 @@ def test_a_mistake_is_named_with_file_key_and_reason(
 )
 def test_every_key_changes_the_digest(tmp_path: Path, name: str, old: str, new: str) -> None:
     """Also one of the car, of the track, and of the manoeuvres."""
-    kind, _, of = name.partition("/")
-    found = []
+    kind, _, file_name = name.partition("/")
+    keys = []
     for text in (changed(name, old, old), changed(name, old, new)):
         file = tmp_path / "mine.toml"
         file.write_text(text)
         if kind != "campaigns":
             file = tmp_path / "campaign.toml"
-            file.write_text(changed(SMOKE, f'["{of}"]', f'["{tmp_path}/mine.toml"]'))
+            file.write_text(changed(SMOKE, f'["{file_name}"]', f'["{tmp_path}/mine.toml"]'))
         campaign = load_campaign(str(file), SHIPPED_CONFIGS)
-        found.append({batch.digest for batch in campaign.batches(campaign.first_day)})
-    shipped = load_campaign(of if kind == "campaigns" else "smoke", SHIPPED_CONFIGS)
-    assert found[0] == {batch.digest for batch in shipped.batches(shipped.first_day)}
-    assert found[0].isdisjoint(found[1])
+        keys.append({batch.digest for batch in campaign.batches(campaign.first_day)})
+    shipped = load_campaign(file_name if kind == "campaigns" else "smoke", SHIPPED_CONFIGS)
+    assert keys[0] == {batch.digest for batch in shipped.batches(shipped.first_day)}
+    assert keys[0].isdisjoint(keys[1])
 
 
 def test_the_pace_determines_the_batch_and_further_days_none(tmp_path: Path) -> None:

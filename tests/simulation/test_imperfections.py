@@ -74,23 +74,23 @@ def test_load_in_the_boot_moves_the_centre_of_gravity_as_statics_asks() -> None:
 def roughness(**road: float) -> list[np.ndarray]:
     track = load_track("waterford_hills", SHIPPED_CONFIGS)
     station_m, _ = track.grid(1.0)
-    found = surface(
+    surfaces = surface(
         RoadImperfections.model_validate(road),
         track,
         station_m,
         np.random.default_rng(1),
         np.random.default_rng(2),
     )
-    assert found is not None
-    return list(found)
+    assert surfaces is not None
+    return list(surfaces)
 
 
 def test_slopes_pull_downhill_and_bends_lean_inwards() -> None:
-    along, across, left, right, wind = roughness(cross_slope_percent=2.5)
+    along, across, grip_left, right, wind = roughness(cross_slope_percent=2.5)
     np.testing.assert_allclose(across, -9.80665 * np.sin(np.arctan(0.025)))
     assert not along.any()
     assert not wind.any()
-    np.testing.assert_array_equal(left, right)
+    np.testing.assert_array_equal(grip_left, right)
     track = load_track("waterford_hills", SHIPPED_CONFIGS)
     curvature = track.curvature(track.grid(1.0)[0])
     inwards = roughness(superelevation_percent=6.0)[1]
@@ -106,9 +106,9 @@ def test_a_lap_goes_as_far_up_as_down() -> None:
 
 
 def test_adhesion_differs_along_the_road_and_across_it() -> None:
-    _, _, left, right, _ = roughness(adhesion_std=0.05, adhesion_split_std=0.1)
-    assert np.std((left + right) / 2) == pytest.approx(0.05 * np.sqrt(2 / 3), rel=0.3)
-    assert np.std(left - right) == pytest.approx(0.1 * np.sqrt(2 / 3), rel=0.3)
+    _, _, grip_left, right, _ = roughness(adhesion_std=0.05, adhesion_split_std=0.1)
+    assert np.std((grip_left + right) / 2) == pytest.approx(0.05 * np.sqrt(2 / 3), rel=0.3)
+    assert np.std(grip_left - right) == pytest.approx(0.1 * np.sqrt(2 / 3), rel=0.3)
 
 
 def test_the_realistic_fleet_s_cars_understeer_as_cars_do() -> None:
@@ -118,8 +118,8 @@ def test_the_realistic_fleet_s_cars_understeer_as_cars_do() -> None:
     speeds_kmh = []
     for drive in drives:
         compliance = np.radians(drive.flaws.car.steering_compliance_deg_per_kn) / 1000
-        known = handling(drive.vehicle, float(compliance))
-        speeds_kmh.append(3.6 * np.sqrt(known.wheelbase / known.understeer))
+        figures = handling(drive.vehicle, float(compliance))
+        speeds_kmh.append(3.6 * np.sqrt(figures.wheelbase / figures.understeer))
     assert 65 < np.median(speeds_kmh) < 100
     assert np.mean(np.array(speeds_kmh) < 65) < 0.05
 

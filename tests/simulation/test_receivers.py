@@ -61,9 +61,9 @@ def test_the_course_changes_as_heading_and_side_slip_angle_do() -> None:
     drive = truth()
     fixes = logged(EXACT, drive)
     slip = np.arctan2(drive["vy_mps"], drive["vx_mps"])
-    found, at = changes(fixes, drive, 400)
+    rates, at = changes(fixes, drive, 400)
     assert len(at) == 260
-    assert np.abs(found - (slip[at] - slip[at - 400])).max() < 1.01 * RAD
+    assert np.abs(rates - (slip[at] - slip[at - 400])).max() < 1.01 * RAD
     assert np.ptp(fixes.counts["course"][fixes.gps_fix].astype(int)) > 64_000, "it goes round"
     speed = fixes.counts["satellite_speed"][fixes.gps_fix] * 0.005
     assert np.abs(speed - np.hypot(drive["vx_mps"], drive["vy_mps"])[fixes.gps_fix]).max() <= 0.0026
@@ -79,8 +79,11 @@ def test_a_delay_is_of_course_and_speed() -> None:
 
 def test_an_antenna_before_the_place_it_is_taken_for_adds_yaw_rate_over_speed() -> None:
     drive = truth()
-    now, there = logged(EXACT, drive), logged(EXACT.model_copy(update={"antenna_x_m": 1.0}), drive)
-    more = (there.counts["course"] - now.counts["course"])[now.gps_fix] * RAD
+    now, displaced = (
+        logged(EXACT, drive),
+        logged(EXACT.model_copy(update={"antenna_x_m": 1.0}), drive),
+    )
+    more = (displaced.counts["course"] - now.counts["course"])[now.gps_fix] * RAD
     assert np.abs(more - drive["yaw_rate_rad_s"][now.gps_fix] / 15.0).max() < 2e-4
 
 

@@ -129,32 +129,32 @@ def truth(**changes: FloatArray | float) -> dict[str, FloatArray]:
 
 
 def seen(
-    of: dict[str, FloatArray], car: CarImperfections = PERFECT, **sensors: float
+    channels: dict[str, FloatArray], car: CarImperfections = PERFECT, **sensors: float
 ) -> dict[str, FloatArray]:
     flaws = Imperfections(car=car, sensors=SensorImperfections.model_validate(sensors))
-    return distort(of, flaws, np.random.default_rng(1), np.random.default_rng(2))
+    return distort(channels, flaws, np.random.default_rng(1), np.random.default_rng(2))
 
 
 def test_a_leaning_body_adds_its_share_of_the_weight() -> None:
     """At 4 °/g an accelerometer reads sin(4° ay/g) g more: 7 % (Milliken and Milliken 1995)."""
     car = CarImperfections(roll_gradient_deg_per_g=4.0, pitch_gradient_deg_per_g=2.0)
-    found = seen(
+    signals = seen(
         truth(ay_mps2=5.0, leaning_ay_mps2=5.0, ax_mps2=-4.0, leaning_ax_mps2=-4.0), car=car
     )
     roll = np.radians(4.0 * 5.0 / 9.80665)
-    assert found["ay_mps2"][-1] == pytest.approx(
+    assert signals["ay_mps2"][-1] == pytest.approx(
         5.0 * np.cos(roll) + 9.80665 * np.sin(roll), abs=1e-4
     )
     pitch = np.radians(2.0 * -4.0 / 9.80665)
-    assert found["ax_mps2"][-1] == pytest.approx(
+    assert signals["ax_mps2"][-1] == pytest.approx(
         -4.0 * np.cos(pitch) + 9.80665 * np.sin(pitch), abs=1e-4
     )
 
 
 def test_an_accelerometer_off_the_centre_feels_the_turning() -> None:
     """A point fixed to a body has a + ω̇ × r + ω × (ω × r)."""
-    of = truth(yaw_rate_rad_s=0.5, yaw_acceleration_rad_s2=1.2, ay_mps2=2.0)
-    found = seen(of, inertial_x_m=0.4, inertial_y_m=-0.3)
+    motion = truth(yaw_rate_rad_s=0.5, yaw_acceleration_rad_s2=1.2, ay_mps2=2.0)
+    signals = seen(motion, inertial_x_m=0.4, inertial_y_m=-0.3)
     place = np.array([0.4, -0.3, 0.0])
     spin, spin_rate = np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.0, 1.2])
     expected = (
@@ -162,28 +162,28 @@ def test_an_accelerometer_off_the_centre_feels_the_turning() -> None:
         + np.cross(spin_rate, place)
         + np.cross(spin, np.cross(spin, place))
     )
-    assert found["ax_mps2"][0] == pytest.approx(expected[0])
-    assert found["ay_mps2"][0] == pytest.approx(expected[1])
+    assert signals["ax_mps2"][0] == pytest.approx(expected[0])
+    assert signals["ay_mps2"][0] == pytest.approx(expected[1])
 
 
 def test_a_turned_unit_mixes_the_axes() -> None:
-    found = seen(truth(ay_mps2=4.0), inertial_yaw_deg=1.0, inertial_roll_deg=0.5)
-    assert found["ax_mps2"][0] == pytest.approx(np.sin(np.radians(1.0)) * 4.0, abs=2e-3)
-    assert found["ay_mps2"][0] == pytest.approx(4.0 + 9.80665 * np.sin(np.radians(0.5)), abs=1e-3)
+    signals = seen(truth(ay_mps2=4.0), inertial_yaw_deg=1.0, inertial_roll_deg=0.5)
+    assert signals["ax_mps2"][0] == pytest.approx(np.sin(np.radians(1.0)) * 4.0, abs=2e-3)
+    assert signals["ay_mps2"][0] == pytest.approx(4.0 + 9.80665 * np.sin(np.radians(0.5)), abs=1e-3)
 
 
-def test_offsets_and_scale_of_angles() -> None:
-    found = seen(
+def test_angles_have_an_offset_and_a_scale() -> None:
+    signals = seen(
         truth(steering_wheel_rad=0.2, steer_fl_rad=0.01, steer_fr_rad=0.01, sideslip_rad=0.02),
         steering_offset_deg=2.0,
         wheel_angle_offset_fl_deg=0.1,
         wheel_angle_scale_error=0.05,
         label_offset_deg=-0.1,
     )
-    assert found["steering_wheel_rad"][0] == pytest.approx(0.2 + np.radians(2.0))
-    assert found["steer_fl_rad"][0] == pytest.approx(0.0105 + np.radians(0.1))
-    assert found["steer_fr_rad"][0] == pytest.approx(0.0105)
-    assert found["sideslip_rad"][0] == pytest.approx(0.02 - np.radians(0.1))
+    assert signals["steering_wheel_rad"][0] == pytest.approx(0.2 + np.radians(2.0))
+    assert signals["steer_fl_rad"][0] == pytest.approx(0.0105 + np.radians(0.1))
+    assert signals["steer_fr_rad"][0] == pytest.approx(0.0105)
+    assert signals["sideslip_rad"][0] == pytest.approx(0.02 - np.radians(0.1))
 
 
 @pytest.mark.parametrize("latency_s", [0.01, 0.045, 0.2])
@@ -206,16 +206,16 @@ def test_a_low_pass_passes_half_of_the_power_at_its_bandwidth(bandwidth_hz: floa
 
 def test_pulses_are_timed_at_any_speed() -> None:
     speed = np.full(ROWS, 60.0)
-    found = timed_pulses(speed, np.zeros(48))
-    np.testing.assert_allclose(found[10:], 60.0, rtol=1e-9)
+    speeds = timed_pulses(speed, np.zeros(48))
+    np.testing.assert_allclose(speeds[10:], 60.0, rtol=1e-9)
     slow = timed_pulses(np.full(ROWS, 0.8), np.zeros(48))  # six pulses a second
     np.testing.assert_allclose(slow[100:], 0.8, rtol=1e-6)
 
 
 def test_uneven_pulses_repeat_with_every_turn() -> None:
     places = 0.02 * np.random.default_rng(3).standard_normal(48)
-    found = timed_pulses(np.full(ROWS, 2 * np.pi * 10), places)  # a turn is ten samples
-    error = found[20:] / (2 * np.pi * 10) - 1
+    speeds = timed_pulses(np.full(ROWS, 2 * np.pi * 10), places)  # a turn is ten samples
+    error = speeds[20:] / (2 * np.pi * 10) - 1
     assert 0.001 < np.std(error) < 0.02
     assert np.corrcoef(error[10:], error[:-10])[0, 1] > 0.99
 
@@ -225,8 +225,8 @@ def test_lasting_errors_have_their_spread_and_forget_in_their_time() -> None:
     assert np.std(errors, axis=1) == pytest.approx(np.ones(4), rel=0.1)
     for tau_s in (1.0, 2.0):
         ticks = int(tau_s * 100)
-        found = [np.corrcoef(one[:-ticks], one[ticks:])[0, 1] for one in errors]
-        assert np.mean(found) == pytest.approx(np.exp(-tau_s / 2.0), abs=0.05)
+        correlations = [np.corrcoef(error[:-ticks], error[ticks:])[0, 1] for error in errors]
+        assert np.mean(correlations) == pytest.approx(np.exp(-tau_s / 2.0), abs=0.05)
     assert abs(np.corrcoef(errors[0], errors[1])[0, 1]) < 0.15
     assert np.abs(np.diff(errors)).max() < 0.2  # no jump from one sample to the next
 

@@ -99,10 +99,10 @@ def test_days_that_landed_before_they_were_recorded_are_recorded(tmp_path: Path)
     batches = [batch for day in campaign().days() for batch in campaign().batches(day)]
     with ThreadPoolExecutor(2) as executor:
         simulate_batches(warehouse, batches, executor)
-    found = [run(tmp_path, campaign(), no_progress) for _ in range(2)]
-    assert [report.rows for report in found] == [0, 0]
-    assert [report.days_present for report in found] == [0, DAYS]
-    assert found[0].logs_version == found[1].logs_version
+    reports = [run(tmp_path, campaign(), no_progress) for _ in range(2)]
+    assert [report.rows for report in reports] == [0, 0]
+    assert [report.days_present for report in reports] == [0, DAYS]
+    assert reports[0].logs_version == reports[1].logs_version
 
 
 def broken_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,7 +137,7 @@ def broken_step(monkeypatch: pytest.MonkeyPatch) -> None:
         (broken_bicycle, "BicycleVehicle"),
     ],
 )
-def test_what_is_not_as_highway_env_drives_is_not_written(
+def test_drives_that_differ_from_highway_env_are_not_written(
     breaking: Callable[[pytest.MonkeyPatch], None],
     vehicle: str,
     run_command: RunCommand,

@@ -102,7 +102,7 @@ def turned_rad(track: Track) -> float:
 def test_a_road_is_of_its_class(named: tuple[str, int]) -> None:
     kind, seed = named
     road, limits = draw_road(kind, seed), CLASSES[kind]
-    sharpest = max(abs(one) for part in road.segments for one in part.curvature_1pm)
+    sharpest = max(abs(curvature) for part in road.segments for curvature in part.curvature_1pm)
     assert 1 / limits.radius_m[1] <= sharpest <= 1 / limits.radius_m[0]
     assert road.length_m >= limits.length_m
     assert road.segments[0].curvature_1pm == road.segments[-1].curvature_1pm == (0.0, 0.0)
@@ -119,7 +119,9 @@ def test_a_name_is_a_class_and_a_seed() -> None:
 
 @given(ROADS, st.floats(1.0, 8.0))
 @settings(max_examples=20, deadline=None)
-def test_who_cuts_turns_as_far_and_less_sharply(named: tuple[str, int], cut_m: float) -> None:
+def test_a_cutting_driver_turns_as_far_and_less_sharply(
+    named: tuple[str, int], cut_m: float
+) -> None:
     road = draw_road(*named)
     line = driven_line(road, cut_m, 0.0, 30.0, random_generator(1))
     assert turned_rad(line) == pytest.approx(turned_rad(road), abs=0.05)
@@ -127,7 +129,7 @@ def test_who_cuts_turns_as_far_and_less_sharply(named: tuple[str, int], cut_m: f
     assert np.abs(line.curvature(station)).max() <= np.abs(road.curvature(station)).max() + 1e-9
 
 
-def test_who_wanders_stays_near_the_line_and_in_its_direction() -> None:
+def test_a_wandering_driver_stays_near_the_line_and_in_its_direction() -> None:
     road = load_track("straight", SHIPPED_CONFIGS)
     line = driven_line(road, 0.0, 0.2, 30.0, random_generator(1)).centre_line(1.0)
     assert 0.05 < np.std(line.y_m - np.polyval(np.polyfit(line.x_m, line.y_m, 1), line.x_m)) < 2

@@ -47,7 +47,7 @@ def drives(roads: list[str], duration_s: float = 3.0) -> tuple[DriveSpec, ...]:
     length = Uniform(min=duration_s, max=duration_s)
     specs = []
     for road in roads:
-        tracks = tuple(one for one in campaign.plan.tracks if one.name == road)
+        tracks = tuple(track for track in campaign.plan.tracks if track.name == road)
         plan = campaign.plan.model_copy(update={"tracks": tracks, "duration_s": length})
         alone = campaign.model_copy(update={"plan": plan})
         specs.append(alone.drives(campaign.first_day)[sorted(SITES).index(road)])
@@ -61,27 +61,27 @@ def batch_of(roads: list[str]) -> Batch:
 def digests_of(order: list[str]) -> list[tuple[str, int, str]]:
     """Simulate a drive on each road, in an order; return the roads, rows and their digests."""
     table = simulate_batch(SIGNALS, batch_of(order)).combine_chunks()
-    found = []
+    digests = []
     for road in sorted(order):
         rows = table.filter([name.as_py() == road for name in table["track"]]).to_pylist()
-        found.append((road, len(rows), hashlib.sha256(repr(rows).encode()).hexdigest()))
-    return found
+        digests.append((road, len(rows), hashlib.sha256(repr(rows).encode()).hexdigest()))
+    return digests
 
 
 def test_a_drive_has_the_same_bytes_in_every_process_and_order() -> None:
     """In another process, which pygame does not greet."""
     roads = sorted(SITES)
     words = [sys.executable, "-c", PROGRAM, *roads[::-1]]
-    there = run(words, env={**os.environ, "PYTHONHASHSEED": "2024"})
-    here = digests_of(roads)
-    assert there.stdout.splitlines() == [str(here)], there.stderr
-    assert [rows for _, rows, _ in here] == pytest.approx([300] * len(roads), rel=0.1)
+    other_process = run(words, env={**os.environ, "PYTHONHASHSEED": "2024"})
+    this_process = digests_of(roads)
+    assert other_process.stdout.splitlines() == [str(this_process)], other_process.stderr
+    assert [rows for _, rows, _ in this_process] == pytest.approx([300] * len(roads), rel=0.1)
 
 
 @pytest.fixture(scope="module", params=sorted(SITES))
 def spec(request: pytest.FixtureRequest) -> DriveSpec:
-    (one,) = drives([request.param], 30.0)
-    return one
+    (drive,) = drives([request.param], 30.0)
+    return drive
 
 
 def planned(spec: DriveSpec) -> SpeedProfile:
@@ -109,7 +109,7 @@ def test_the_car_follows_it_on_four_tyres(spec: DriveSpec) -> None:
     assert log.metadata["track"] == spec.track.name
 
 
-def test_what_highway_env_changes_of_all_cars_changes_no_drive() -> None:
+def test_global_changes_of_highway_env_change_no_drive() -> None:
     """Its intersection sets figures of `IDMVehicle` itself."""
     traffic.require_known_traffic("intersection")
     for road in SITES:
@@ -157,7 +157,9 @@ def test_traffic_of_another_kind_is_refused(
     name: str, tmp_path: Path, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     decided: Callable[..., Any] = getattr(IDMVehicle, name)
-    monkeypatch.setattr(IDMVehicle, name, lambda *given, **named: 1.05 * decided(*given, **named))
+    monkeypatch.setattr(
+        IDMVehicle, name, lambda *arguments, **named: 1.05 * decided(*arguments, **named)
+    )
     done = run_command("simulate", short(tmp_path, 'tracks = ["roundabout"]'))
     assert done.exit_code == RefusedError.exit_code
     assert "on its road 'roundabout' differs" in done.stderr

@@ -89,7 +89,7 @@ def test_no_road_of_the_plan_is_a_blind_one() -> None:
     """Names reach to nine digits; a version's seeds are below that once in 10⁹ versions."""
     with pytest.raises(ConfigError):
         load_track("country_1000000000", SHIPPED_CONFIGS)
-    assert min(one.seed for one in blind_scenarios("ab" * 32, SHIPPED_CONFIGS)) > 1e9
+    assert min(scenario.seed for scenario in blind_scenarios("ab" * 32, SHIPPED_CONFIGS)) > 1e9
     assert (
         load_campaign("proving_roads", SHIPPED_CONFIGS).seed
         != load_campaign("proving_ground", SHIPPED_CONFIGS).seed
@@ -155,15 +155,15 @@ def test_clipped_values_are_counted_in_every_row_of_their_drive() -> None:
 
 
 def test_bytes_do_not_depend_on_threads_or_on_the_order_of_batches() -> None:
-    whole = short_batch()
-    batches = [Batch("smoke", DAY, i, (drive,)) for i, drive in enumerate(whole.drives)]
+    expected = short_batch()
+    batches = [Batch("smoke", DAY, i, (drive,)) for i, drive in enumerate(expected.drives)]
     one_by_one = [simulate_batch(SIGNALS, batch) for batch in batches]
     with ThreadPoolExecutor(4) as threads:
         backwards = list(threads.map(partial(simulate_batch, SIGNALS), reversed(batches)))
-    for here, there in zip(one_by_one, reversed(backwards), strict=True):
-        assert here.equals(there)
+    for forward, backward in zip(one_by_one, reversed(backwards), strict=True):
+        assert forward.equals(backward)
     unified = pa.concat_tables(one_by_one).unify_dictionaries().combine_chunks()
-    assert unified.equals(simulate_batch(SIGNALS, whole))
+    assert unified.equals(simulate_batch(SIGNALS, expected))
 
 
 def on_skid_pad(drive: DriveSpec, lateral_mps2: float) -> DriveSpec:
@@ -204,11 +204,13 @@ def test_the_angle_of_a_loaded_car_is_that_of_the_place_where_the_empty_one_has_
     shift_m = 300 * 1.9 / (body.mass_kg + 300)
     assert car.body.reference_m == pytest.approx(shift_m)
     logs = simulate_logs(SIGNALS, [empty, replace(empty, vehicle=car)], ("vy_mps", "vx_mps"))
-    one, other = (np.mean(log.motion["vy_mps"][500:] / log.motion["vx_mps"][500:]) for log in logs)
+    loaded, other = (
+        np.mean(log.motion["vy_mps"][500:] / log.motion["vx_mps"][500:]) for log in logs
+    )
     radius_m = 1 / float(np.mean(empty.profile.track.curvature(empty.profile.station_m)))
-    assert one == pytest.approx(body.rear_axle_m / radius_m, abs=0.002)
-    assert other == pytest.approx(one, abs=0.1 * shift_m / radius_m)
+    assert loaded == pytest.approx(body.rear_axle_m / radius_m, abs=0.002)
+    assert other == pytest.approx(loaded, abs=0.1 * shift_m / radius_m)
     label = SIGNALS["sideslip"]
-    for log, expected in zip(logs, (one, other), strict=True):
+    for log, expected in zip(logs, (loaded, other), strict=True):
         measured = np.mean(log.measurement.counts["sideslip"][500:]) * float(label.scale)
         assert measured == pytest.approx(expected, abs=0.0005)

@@ -1,4 +1,4 @@
-"""What was simulated before stays what it was: the bits of rows and the digests of batches.
+"""Simulated data stay the same: the bits of rows and the digests of batches.
 
 The sums were taken before cars, roads and sensors had imperfections; those of `proving_ground` and
 of drives with imperfections before roads were rough; those of `fleet_realistic` and `imperfect`
@@ -84,8 +84,8 @@ def short(batch: Batch) -> Batch:
 def test_campaigns_give_the_same_bits(name: str) -> None:
     campaign = load_campaign(name, SHIPPED_CONFIGS)
     batch = campaign.batches(campaign.days()[0])[0]
-    found = (campaign.digest, batch.digest, checksum(simulate_batch(SIGNALS, short(batch))))
-    assert found == CAMPAIGNS[name]
+    digests = (campaign.digest, batch.digest, checksum(simulate_batch(SIGNALS, short(batch))))
+    assert digests == CAMPAIGNS[name]
 
 
 @pytest.mark.parametrize("name", SCENARIOS)

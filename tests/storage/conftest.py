@@ -18,7 +18,7 @@ def server() -> Iterator[Server]:
 
 @pytest.fixture(autouse=True)
 def environment(server: "Server | ServerApart", monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Where the server is, for this process and those that it starts."""
+    """The address of the server, for this process and those that it starts."""
     for name, value in server.environment.items():
         monkeypatch.setenv(name, value)
     yield

@@ -44,7 +44,7 @@ def server() -> Iterator[ServerApart]:
 
 @pytest.fixture(scope="module")
 def local(smoke_root: Path) -> Folder:
-    """What the commands make in a folder."""
+    """The files that the commands write in a folder."""
     return LocalFolder(smoke_root)
 
 
@@ -81,23 +81,25 @@ def test_questions_are_answered_as_in_a_folder(filled: Folder, local: Folder) ->
         ["select", "--json"],
         ["verify", "--full", "--json"],
     ):
-        there, here = (command_on(root, *question) for root in (filled, local))
-        assert (there.exit_code, there.stdout) == (here.exit_code, here.stdout), there.stderr
+        remote, in_folder = (command_on(root, *question) for root in (filled, local))
+        assert (remote.exit_code, remote.stdout) == (in_folder.exit_code, in_folder.stdout), (
+            remote.stderr
+        )
     scores = [command_on(root, "score", "smoke", "--json").json for root in (filled, local)]
     assert scores[0] == pytest.approx(scores[1])  # sums of float64 differ in the last digits
     status = command_on(filled, "status", "--json").json
     assert [table["rows"] for table in status["tables"].values()] == [55957, 16, 0]
 
 
-def test_what_is_damaged_is_found(copied: Folder) -> None:
+def test_a_damaged_file_is_detected(copied: Folder) -> None:
     root = copied
     victim = next(file for file in root.files() if file.path.startswith("logs/day="))
-    whole = root.read(victim.path)
-    root.put(victim.path, whole[:-1] + b"?")
-    found = command_on(root, "verify")
-    assert found.exit_code == DAMAGE
-    assert victim.path in found.stdout
-    root.put(victim.path, whole)
+    content = root.read(victim.path)
+    root.put(victim.path, content[:-1] + b"?")
+    verification = command_on(root, "verify")
+    assert verification.exit_code == DAMAGE
+    assert victim.path in verification.stdout
+    root.put(victim.path, content)
     assert command_on(root, "verify").exit_code == 0
 
 
@@ -126,10 +128,10 @@ def test_erasure_does_not_depend_on_the_clock_of_the_store(
     done = command_on(copied, "forget", "--drive", drive, "--now", "--json")
     assert (done.exit_code, done.json["pending"]) == (0, [])
     assert len(before.keys() - stored(copied).keys()) == 3
-    left = [file for file in copied.files() if file.path.endswith(".parquet")]
+    remaining = [file for file in copied.files() if file.path.endswith(".parquet")]
     warehouse = Warehouse(copied)
     active = {f"{t.folder.name}/{f.path}" for t in warehouse.tables for f in t.snapshot().files}
-    assert {file.path for file in left if "/versions/" not in file.path} == active
+    assert {file.path for file in remaining if "/versions/" not in file.path} == active
 
 
 def test_processes_at_once_lose_and_double_nothing(server: ServerApart, local: Folder) -> None:
@@ -141,11 +143,11 @@ def test_processes_at_once_lose_and_double_nothing(server: ServerApart, local: F
             assert done.exit_code == 0, done.stderr
     rows = command_on(root, "sql", "--json", "SELECT count(*) AS n FROM log").json
     assert rows == [{"n": 55957}]
-    whole, expected = stored(root), stored(local)
-    versions = [path for path in whole if path.startswith("models/") and "/versions/" in path]
+    actual, expected = stored(root), stored(local)
+    versions = [path for path in actual if path.startswith("models/") and "/versions/" in path]
     assert [path for path in versions if path.endswith(".json")] == ["models/smoke/versions/1.json"]
     assert len(versions) == 2  # and the drives that it was trained on
-    assert contents_of_logs(whole) == contents_of_logs(expected)
+    assert contents_of_logs(actual) == contents_of_logs(expected)
     assert command_on(root, "verify", "--full").exit_code == 0
 
 

@@ -44,7 +44,7 @@ def problems(warehouse: Warehouse) -> dict[str, str]:
 
 
 def consequences(content: bytes) -> Any:
-    """What a commit does: all of it but the Delta library's remarks on time, program and mode.
+    """The actions of a commit, without the Delta library's remarks on time, program and mode.
 
     The note of the commit that only makes the table has nothing to tell but its own checksum.
     """
@@ -57,8 +57,8 @@ def consequences(content: bytes) -> Any:
 
 
 def _without_nulls(content: dict[str, Any]) -> dict[str, Any]:
-    kept = {k: v for k, v in content.items() if v is not None}
-    return {k: v for k, v in sorted(kept.items()) if "xtendedFileMetadata" not in str(kept)}
+    fields = {k: v for k, v in content.items() if v is not None}
+    return {k: v for k, v in sorted(fields.items()) if "xtendedFileMetadata" not in str(fields)}
 
 
 def test_sound_logs_have_no_problems(root: Warehouse) -> None:

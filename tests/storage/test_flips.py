@@ -37,8 +37,8 @@ Answer = Callable[[Warehouse], Any]
 
 
 def sums(warehouse: Warehouse) -> Any:
-    found = load_cohort(warehouse, folding=Folding(count=2))
-    return found.folds("drive", 2).tables, found.drive_count
+    cohort = load_cohort(warehouse, folding=Folding(count=2))
+    return cohort.folds("drive", 2).tables, cohort.drive_count
 
 
 def new_gram_rows(warehouse: Warehouse) -> Any:
@@ -95,7 +95,7 @@ def test_a_flipped_bit_is_told_or_makes_no_difference(
     rng = random.Random(0)  # noqa: S311
     files = sorted(path_of(filled.root).glob(pattern))
     usual = answer(filled)
-    told = 0
+    detected = 0
     for _ in range(FLIPS):
         file = rng.choice(files)
         bit = rng.randrange(file.stat().st_size * 8)
@@ -103,9 +103,9 @@ def test_a_flipped_bit_is_told_or_makes_no_difference(
             try:
                 assert answer(filled) == usual, (file, bit)
             except FleetSlipError:
-                told += 1
+                detected += 1
     assert answer(filled) == usual
-    assert told
+    assert detected
 
 
 def test_a_file_is_read_once_while_it_stays_the_same(
@@ -167,14 +167,14 @@ def flipping(server: Server, path: str, share: float = 1.0) -> Iterator[None]:
 
 def ask_all(warehouse: Warehouse) -> tuple[dict[str, Any], int]:
     """Return the answers by question, and how many were refused for what is damaged."""
-    found, refused = {}, 0
+    answers, refused = {}, 0
     for name, ask in QUESTIONS.items():
         objects._fetched.clear()
         try:
-            found[name] = ask(warehouse)
+            answers[name] = ask(warehouse)
         except StorageError:
             refused += 1
-    return found, refused
+    return answers, refused
 
 
 @pytest.mark.parametrize("path", ["/grams/[^_]", "/logs/day=", "/models/"])
@@ -184,9 +184,9 @@ def test_an_answer_with_a_flipped_bit_is_no_answer(
     usual, none = ask_all(stored)
     assert none == 0
     with flipping(server, path):
-        found, refused = ask_all(stored)
+        answers, refused = ask_all(stored)
     assert refused
-    assert found == {name: usual[name] for name in found}  # these did not look there
+    assert answers == {name: usual[name] for name in answers}  # these did not look there
     assert ask_all(stored) == (usual, 0)
 
 
@@ -204,7 +204,7 @@ def test_single_flipped_answers_among_many_change_nothing(
     refusals = 0
     for _ in range(4):
         with flipping(server, "/(grams/[^_]|logs/day=|models/)", 0.2):
-            found, refused = ask_all(stored)
+            answers, refused = ask_all(stored)
         refusals += refused
-        assert found == {name: usual[name] for name in found}
+        assert answers == {name: usual[name] for name in answers}
     assert refusals

@@ -33,7 +33,7 @@ def rows(drive: str, count: int = 20) -> object:
     return log_rows(drive, random_counts(np.random.default_rng(0), count))
 
 
-def test_what_is_put_is_read_listed_and_removed(root: Folder) -> None:
+def test_files_are_put_read_listed_and_removed(root: Folder) -> None:
     assert not root.exists()
     assert (root.names(), root.files()) == ([], [])
     folder = root / "models" / "m"
@@ -67,14 +67,14 @@ def test_a_file_is_known_again_where_listings_tell_its_state_otherwise(
     assert root.remove(file)
 
 
-def test_of_many_that_create_a_file_one_has_made_it(root: Folder) -> None:
+def test_one_of_many_creators_of_a_file_succeeds(root: Folder) -> None:
     with ThreadPoolExecutor(8) as executor:
-        made = list(
+        results = list(
             executor.map(
                 lambda n: (n % 5, root.create(f"{n % 5}.json", str(n).encode())), range(40)
             )
         )
-    assert Counter(name for name, won in made if won) == Counter(range(5))
+    assert Counter(name for name, won in results if won) == Counter(range(5))
 
 
 def test_no_document_is_lost_or_doubled_where_answers_are_lost(
@@ -88,8 +88,8 @@ def test_no_document_is_lost_or_doubled_where_answers_are_lost(
     with server.misbehaving(failing=0.2, slow_s=0.01), ThreadPoolExecutor(3) as executor:
         taken = [number for numbers in executor.map(write, range(3)) for number in numbers]
     assert sorted(taken) == folder.numbers() == list(range(1, 25))
-    found = Counter((d.content["writer"], d.content["n"]) for d in map(folder.read, taken))
-    assert found == Counter((writer, n) for writer in range(3) for n in range(8))
+    counts = Counter((d.content["writer"], d.content["n"]) for d in map(folder.read, taken))
+    assert counts == Counter((writer, n) for writer in range(3) for n in range(8))
 
 
 def test_units_land_once_where_answers_are_lost(root: Folder, server: Server) -> None:
@@ -110,8 +110,8 @@ def test_units_land_once_where_answers_are_lost(root: Folder, server: Server) ->
     with server.misbehaving(failing=0.1), ThreadPoolExecutor(3) as executor:
         list(executor.map(bring, [n // 2 for n in range(8)]))  # each is brought twice
     assert logs.snapshot().rows == 4 * 20
-    found = ask(root, "SELECT drive_id, count(*) FROM log GROUP BY 1")
-    assert sorted(found) == [(f"d{n}", 20) for n in range(4)]
+    counts = ask(root, "SELECT drive_id, count(*) FROM log GROUP BY 1")
+    assert sorted(counts) == [(f"d{n}", 20) for n in range(4)]
 
 
 def test_a_name_of_a_data_file_is_used_once(root: Folder) -> None:
@@ -171,9 +171,9 @@ def test_a_file_or_a_column_that_is_not_there_is_named(tmp_path: Path) -> None:
     ],
 )
 def test_a_url_that_is_none_is_refused_and_not_repeated(url: str) -> None:
-    with pytest.raises(StorageError, match="is written as") as told:
+    with pytest.raises(StorageError, match="is written as") as caught:
         data_root(url)
-    assert SECRET_KEY not in str(told.value)
+    assert SECRET_KEY not in str(caught.value)
 
 
 def test_urls_of_other_stores_are_data_roots() -> None:
@@ -219,7 +219,7 @@ def never_answer(server: Server, patch: pytest.MonkeyPatch, silent: socket.socke
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("fault", "message"),
     [
         (refuse_writes, "the credentials do not permit this"),
         (fail_always, "the store answers with errors"),
@@ -235,7 +235,7 @@ def test_a_fault_is_told_in_one_line_without_credentials(
     monkeypatch: pytest.MonkeyPatch,
     silent: socket.socket,
     fault: Fault,
-    told: str,
+    message: str,
 ) -> None:
     monkeypatch.setattr(objects, "RETRY_S", 2)
     logs = Warehouse(root).logs
@@ -248,7 +248,7 @@ def test_a_fault_is_told_in_one_line_without_credentials(
             lambda: Warehouse(root).logs.snapshot().commit(Change(add=[action])),
         )
         for attempt in attempts:
-            with pytest.raises(StorageError, match=told) as error:
+            with pytest.raises(StorageError, match=message) as error:
                 attempt()
             assert "\n" not in str(error.value)
             assert not {ACCESS_KEY, SECRET_KEY} & set(str(error.value).split())
@@ -266,9 +266,9 @@ def test_a_missing_object_is_told_by_a_query(root: Folder) -> None:
     land(warehouse, "one", rows("a"))
     (file,) = warehouse.logs.folder.files()[-1:]
     assert warehouse.logs.folder.remove(file)
-    with pytest.raises(StorageError, match="there is no such object") as told:
+    with pytest.raises(StorageError, match="there is no such object") as caught:
         update_grams(warehouse)
-    assert "Traceback" not in str(told.value)
+    assert "Traceback" not in str(caught.value)
 
 
 CONTENT = bytes(range(256)) * 1200
@@ -337,7 +337,7 @@ def test_an_answer_is_told_by_its_most_telling_part(meaning: str) -> None:
 
 
 @pytest.mark.parametrize("answer", ["", "a surprise", "4500 bytes", "port 5000", "1429 rows"])
-def test_what_is_not_known_is_not_guessed(answer: str) -> None:
+def test_an_unknown_answer_is_not_interpreted(answer: str) -> None:
     assert store_error(OSError(answer)).startswith("the store cannot be used (OSError)")
 
 
@@ -346,10 +346,10 @@ def test_failures_of_a_store_become_ours_with_the_place_and_without_the_answer(
     kind: type[Exception],
 ) -> None:
     with (
-        pytest.raises(StorageError, match=r"^s3://bucket/data: the store refuses the") as told,
+        pytest.raises(StorageError, match=r"^s3://bucket/data: the store refuses the") as caught,
         object_errors("s3://bucket/data"),
     ):
         raise kind(f"<Error><Code>InvalidAccessKeyId</Code>{SECRET}</Error>")
-    assert SECRET not in str(told.value)
-    assert told.value.__cause__ is None
-    assert told.value.__suppress_context__
+    assert SECRET not in str(caught.value)
+    assert caught.value.__cause__ is None
+    assert caught.value.__suppress_context__

@@ -50,7 +50,7 @@ def test_a_run_is_two_lines_and_one_row(tmp_path: Path) -> None:
     assert row["arguments"] == ["simulate", "smoke"]
     assert (row["outcome"], row["exit_code"], row["error"]) == ("done", 0, None)
     assert (row["rows"], row["size_bytes"], row["process"]) == (100, 950, os.getpid())
-    assert [one["name"] for one in row["steps"]] == ["simulate", "gram"]
+    assert [entry["name"] for entry in row["steps"]] == ["simulate", "gram"]
     assert row["started_at"] == run.started_at
     assert row["ended_at"] >= row["started_at"]
 
@@ -67,7 +67,7 @@ def test_a_failure_is_recorded_with_its_exit_code_and_raised(tmp_path: Path) -> 
     failed, interrupted = runs(tmp_path)
     assert (failed["outcome"], failed["exit_code"]) == ("failed", 4)
     assert failed["error"] == f"{HIDDEN}.csv: no such file."
-    assert [one["name"] for one in failed["steps"]] == ["ingest"]
+    assert [entry["name"] for entry in failed["steps"]] == ["ingest"]
     assert (interrupted["outcome"], interrupted["exit_code"]) == ("interrupted", 130)
 
 
@@ -80,7 +80,7 @@ def test_a_data_root_that_does_not_exist_is_not_made(tmp_path: Path) -> None:
     assert [row["outcome"] for row in runs(tmp_path / "data")] == ["done"]
 
 
-def test_what_cannot_be_recorded_does_not_fail_the_command(
+def test_an_unwritable_record_does_not_fail_the_command(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "runs").write_text("a file where the folder should be")
@@ -160,11 +160,11 @@ def changed(file: Path) -> list[str]:
 
 
 def test_every_flipped_bit_is_found(history: Path) -> None:
-    whole = history.read_bytes()
-    assert read_lines(whole)[1] == []
+    content = history.read_bytes()
+    assert read_lines(content)[1] == []
     missed = []
-    for bit in range(len(whole) * 8):
-        damaged = bytearray(whole)
+    for bit in range(len(content) * 8):
+        damaged = bytearray(content)
         damaged[bit // 8] ^= 1 << bit % 8
         if not read_lines(bytes(damaged))[1]:
             missed.append(bit)
@@ -183,8 +183,8 @@ def test_readers_take_nothing_from_a_changed_line(history: Path) -> None:
 
 
 def test_a_torn_line_is_damage(history: Path) -> None:
-    whole = history.read_bytes()
-    history.write_bytes(whole + b"\n" + whole.split(b"\n")[1][:40])
+    content = history.read_bytes()
+    history.write_bytes(content + b"\n" + content.split(b"\n")[1][:40])
     assert len(changed(history)) == 1
 
 
@@ -195,12 +195,12 @@ def run_of(**changes: Any) -> dict[str, Any]:
 
 
 def test_processes_of_one_number_are_told_apart() -> None:
-    mine = process_began(os.getpid())
-    assert mine == process_began(os.getpid())
+    began = process_began(os.getpid())
+    assert began == process_began(os.getpid())
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
         theirs = process_began(other.pid)
         other.communicate()
-    assert None is not mine != theirs is not None
+    assert None is not began != theirs is not None
     assert process_began(other.pid) != theirs
 
 

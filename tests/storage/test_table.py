@@ -152,14 +152,14 @@ def test_a_removal_conflicts_with_a_removal_of_the_same_file(warehouse: Warehous
     for name in "ab":
         action = warehouse.logs.write_file(name, rows(name, 10), DAY)
         warehouse.logs.snapshot().commit(Change(add=[action]))
-    one, two = warehouse.logs.snapshot(), warehouse.logs.snapshot()
-    one.commit(Change(remove=one.files[:1]))
+    first, second = warehouse.logs.snapshot(), warehouse.logs.snapshot()
+    first.commit(Change(remove=first.files[:1]))
     with pytest.raises(ConflictError, match="Run the same command again"):
-        two.commit(Change(remove=two.files[:1]))
+        second.commit(Change(remove=second.files[:1]))
     assert len(warehouse.logs.snapshot().files) == 1
 
 
-def test_what_a_commit_adds_and_removes_stays(warehouse: Warehouse) -> None:
+def test_files_of_a_commit_are_added_and_removed(warehouse: Warehouse) -> None:
     action = warehouse.logs.write_file("one", rows("a", 10), DAY)
     warehouse.logs.snapshot().commit(Change(add=[action]))
     snapshot = warehouse.logs.snapshot()
@@ -168,10 +168,10 @@ def test_what_a_commit_adds_and_removes_stays(warehouse: Warehouse) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "told"), [(28, "the disk is full"), (30, "read-only"), (13, "permission denied")]
+    ("number", "message"), [(28, "the disk is full"), (30, "read-only"), (13, "permission denied")]
 )
 def test_a_fault_during_a_commit_is_told_as_what_it_is(
-    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, number: int, told: str
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, number: int, message: str
 ) -> None:
     action = warehouse.logs.write_file("one", rows("a", 10), DAY)
     warehouse.logs.snapshot().commit(Change(add=[action]))
@@ -181,7 +181,7 @@ def test_a_fault_during_a_commit_is_told_as_what_it_is(
 
     snapshot = warehouse.logs.snapshot()
     monkeypatch.setattr("deltalake.DeltaTable.create_write_transaction", fail)
-    with pytest.raises(StorageError, match=told):
+    with pytest.raises(StorageError, match=message):
         snapshot.commit(Change(add=[action]))
 
 
@@ -248,9 +248,12 @@ def test_the_encodings_are_those_asked_for_in_groups_of_a_fixed_size() -> None:
     columns = {"car": ["a"] * count, "ax": pa.array(range(count), pa.int32())}
     encoding = Encoding(dictionary=("car",), delta_packed=("ax",), compression="zstd")
     encoded = encoding.encode(pa.table(columns))
-    found = pq.read_metadata(pa.BufferReader(encoded.content))
-    assert [found.row_group(i).num_rows for i in range(found.num_row_groups)] == [count - 1, 1]
-    car, ax = (found.row_group(0).column(i) for i in range(2))
+    metadata = pq.read_metadata(pa.BufferReader(encoded.content))
+    assert [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)] == [
+        count - 1,
+        1,
+    ]
+    car, ax = (metadata.row_group(0).column(i) for i in range(2))
     assert "RLE_DICTIONARY" in car.encodings
     assert "DELTA_BINARY_PACKED" in ax.encodings
     assert car.compression == "ZSTD"

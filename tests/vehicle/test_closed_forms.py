@@ -36,12 +36,12 @@ def lagged_step(bicycle: LinearBicycle, lag_s: float) -> FloatArray:
 def test_a_small_step_of_the_steering_answers_as_the_bicycle(name: str) -> None:
     car = load_vehicle(name, SHIPPED_CONFIGS)
     bicycle = LinearBicycle.from_car(car, SPEED_MPS)
-    found = steer(car, PERFECT, np.full(len(TIME_S), car.steering.ratio * SMALL_RAD), SPEED_MPS)
+    motion = steer(car, PERFECT, np.full(len(TIME_S), car.steering.ratio * SMALL_RAD), SPEED_MPS)
     vy, rate = SMALL_RAD * lagged_step(bicycle, car.steering.lag_s)
-    assert found.yaw_rate_rad_s[-1] == pytest.approx(SMALL_RAD * bicycle.yaw_gain_1ps, rel=0.03)
-    assert np.abs(found.yaw_rate_rad_s - rate).max() < 0.04 * rate.max()
+    assert motion.yaw_rate_rad_s[-1] == pytest.approx(SMALL_RAD * bicycle.yaw_gain_1ps, rel=0.03)
+    assert np.abs(motion.yaw_rate_rad_s - rate).max() < 0.04 * rate.max()
     slip = vy / SPEED_MPS
-    assert np.abs(found.sideslip_rad - slip).max() < 0.05 * np.abs(slip).max()
+    assert np.abs(motion.sideslip_rad - slip).max() < 0.05 * np.abs(slip).max()
 
 
 @pytest.mark.parametrize("name", CARS)
@@ -54,9 +54,9 @@ def test_a_small_sine_of_the_steering_answers_as_the_bicycle(
     time_s = np.arange(0.0, 8.0, 0.01)
     wave = np.exp(2j * np.pi * frequency_hz * time_s)
     demand = car.steering.ratio * SMALL_RAD * wave.imag
-    found = steer(car, PERFECT, demand, SPEED_MPS)
+    motion = steer(car, PERFECT, demand, SPEED_MPS)
     late = slice(300, 300 + round(2 / frequency_hz) * 100)
-    amplitude = 2j * np.mean(found.yaw_rate_rad_s[late] * wave.conj()[late]) / SMALL_RAD
+    amplitude = 2j * np.mean(motion.yaw_rate_rad_s[late] * wave.conj()[late]) / SMALL_RAD
     # The demand is held for 10 ms, on average 5 ms late.
     lag = 1 / (1 + 2j * np.pi * frequency_hz * car.steering.lag_s)
     held = np.exp(-2j * np.pi * frequency_hz * 0.005)
@@ -92,6 +92,6 @@ def test_a_compliant_steering_answers_as_a_softer_front_axle() -> None:
     flaws = CarImperfections(steering_compliance_deg_per_kn=0.15)
     soft = LinearBicycle.from_car(car, SPEED_MPS, float(np.radians(0.15)) / 1000)
     demand = np.full(len(TIME_S), car.steering.ratio * SMALL_RAD)
-    found = steer(car, flaws, demand, SPEED_MPS)
-    assert found.yaw_rate_rad_s[-1] == pytest.approx(SMALL_RAD * soft.yaw_gain_1ps, rel=0.02)
+    motion = steer(car, flaws, demand, SPEED_MPS)
+    assert motion.yaw_rate_rad_s[-1] == pytest.approx(SMALL_RAD * soft.yaw_gain_1ps, rel=0.02)
     assert soft.yaw_gain_1ps < 0.8 * RIGID.yaw_gain_1ps

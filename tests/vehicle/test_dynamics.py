@@ -190,8 +190,8 @@ def test_nothing_blows_up_in_any_spin(x: State, u: Controls, adhesion: float) ->
 @pytest.mark.parametrize("share", [0.75, 1.0, 1.33])
 def test_every_car_understeers_at_every_mass(name: str, share: float) -> None:
     car = load_vehicle(name, SHIPPED_CONFIGS)
-    known = handling(car.with_sprung_mass(share * car.body.sprung_mass_kg))
-    assert 0.2 < math.degrees(known.understeer * GRAVITY_MPS2) < 3.0
+    figures = handling(car.with_sprung_mass(share * car.body.sprung_mass_kg))
+    assert 0.2 < math.degrees(figures.understeer * GRAVITY_MPS2) < 3.0
 
 
 def error(step: float) -> float:

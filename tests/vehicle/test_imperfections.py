@@ -77,17 +77,19 @@ def test_a_mirrored_car_on_a_mirrored_road_drives_mirrored() -> None:
         }
     )
     changes = {"gravity_x_mps2": 0.2, "grip_left": 0.8}
-    here = circle(80.0, 15.0, **changes, gravity_y_mps2=0.3, cross_wind_mps=8.0)
-    there = circle(80.0, 15.0, gravity_x_mps2=0.2, grip_right=0.8, gravity_y_mps2=-0.3)
-    assert there.surface is not None
-    there = there._replace(
-        curvature_1pm=-there.curvature_1pm,
-        surface=there.surface._replace(cross_wind_mps=np.full(len(there.speed_mps), -8.0)),
+    road = circle(80.0, 15.0, **changes, gravity_y_mps2=0.3, cross_wind_mps=8.0)
+    mirrored_road = circle(80.0, 15.0, gravity_x_mps2=0.2, grip_right=0.8, gravity_y_mps2=-0.3)
+    assert mirrored_road.surface is not None
+    mirrored_road = mirrored_road._replace(
+        curvature_1pm=-mirrored_road.curvature_1pm,
+        surface=mirrored_road.surface._replace(
+            cross_wind_mps=np.full(len(mirrored_road.speed_mps), -8.0)
+        ),
     )
-    one, other = drive(here, flaws), drive(there, image)
-    np.testing.assert_allclose(other.sideslip_rad, -one.sideslip_rad, atol=1e-9)
-    np.testing.assert_allclose(other.wheel_fr_rad_s, one.wheel_fl_rad_s, rtol=1e-9)
-    np.testing.assert_allclose(other.steer_fr_rad, -one.steer_fl_rad, atol=1e-9)
+    original, other = drive(road, flaws), drive(mirrored_road, image)
+    np.testing.assert_allclose(other.sideslip_rad, -original.sideslip_rad, atol=1e-9)
+    np.testing.assert_allclose(other.wheel_fr_rad_s, original.wheel_fl_rad_s, rtol=1e-9)
+    np.testing.assert_allclose(other.steer_fr_rad, -original.steer_fl_rad, atol=1e-9)
 
 
 def test_compliance_shows_in_the_wheels_and_not_in_what_the_sideslip_is() -> None:
@@ -127,9 +129,9 @@ def test_lash_lets_the_road_wheels_lag_behind_the_steering_wheel() -> None:
 @pytest.mark.parametrize("wheel", ["fl", "fr", "rl", "rr"])
 def test_a_larger_wheel_turns_slower(wheel: str) -> None:
     flaws = CarImperfections(**{f"radius_error_{wheel}": 0.003})
-    found, usual = drive(straight(20.0), flaws), drive(straight(20.0))
+    larger, usual = drive(straight(20.0), flaws), drive(straight(20.0))
     for name in ("fl", "fr", "rl", "rr"):
-        ratio = end(getattr(found, f"wheel_{name}_rad_s")) / end(
+        ratio = end(getattr(larger, f"wheel_{name}_rad_s")) / end(
             getattr(usual, f"wheel_{name}_rad_s")
         )
         assert ratio == pytest.approx(1 / 1.003 if name == wheel else 1.0, abs=2e-4), name
@@ -138,7 +140,7 @@ def test_a_larger_wheel_turns_slower(wheel: str) -> None:
 def test_loaded_wheels_roll_on_a_shorter_radius() -> None:
     """The outer wheel gains, the inner loses, what the load transfer shortens and lengthens."""
     road = circle(100.0, 20.0)
-    found = drive(road, CarImperfections(radius_loss_mm_per_kn=1.5))
+    motion = drive(road, CarImperfections(radius_loss_mm_per_kn=1.5))
     usual = drive(road)
     c = constants(SEDAN, 1.0)
     for side, sign in (("rr", 1.0), ("rl", -1.0)):
@@ -148,30 +150,30 @@ def test_loaded_wheels_roll_on_a_shorter_radius() -> None:
         )
         expected = 1 / (1 - 1.5e-6 * load / SEDAN.tyre.rolling_radius_m)
         name = f"wheel_{side}_rad_s"
-        ratio = end(getattr(found, name)) / end(getattr(usual, name))
+        ratio = end(getattr(motion, name)) / end(getattr(usual, name))
         assert ratio == pytest.approx(expected, abs=3e-4)
 
 
 def test_the_thrust_angle_is_side_slip_of_a_car_going_straight() -> None:
     """Rear wheels turned left push the tail left: the car goes straight with its nose right."""
-    found = drive(straight(20.0), CarImperfections(thrust_angle_deg=0.3))
-    assert np.degrees(end(found.sideslip_rad)) == pytest.approx(0.3, abs=0.02)
-    assert np.degrees(end(found.steer_fl_rad)) == pytest.approx(0.3, abs=0.03)
+    motion = drive(straight(20.0), CarImperfections(thrust_angle_deg=0.3))
+    assert np.degrees(end(motion.sideslip_rad)) == pytest.approx(0.3, abs=0.02)
+    assert np.degrees(end(motion.steer_fl_rad)) == pytest.approx(0.3, abs=0.03)
 
 
 def test_toe_turns_the_wheels_against_each_other() -> None:
-    found = drive(straight(20.0), CarImperfections(toe_front_deg=0.2))
-    assert np.degrees(end(found.steer_fl_rad)) == pytest.approx(-0.2, abs=0.01)
-    assert np.degrees(end(found.steer_fr_rad)) == pytest.approx(0.2, abs=0.01)
-    assert abs(end(found.sideslip_rad)) < 1e-4
+    motion = drive(straight(20.0), CarImperfections(toe_front_deg=0.2))
+    assert np.degrees(end(motion.steer_fl_rad)) == pytest.approx(-0.2, abs=0.01)
+    assert np.degrees(end(motion.steer_fr_rad)) == pytest.approx(0.2, abs=0.01)
+    assert abs(end(motion.sideslip_rad)) < 1e-4
 
 
 def test_cold_tyres_stiffen_the_car_and_grow_warm() -> None:
     road = circle(80.0, 18.0)
-    known = handling(SEDAN)
+    figures = handling(SEDAN)
     cold = drive(road, CarImperfections(cold_stiffness=0.2, warm_up_s=1e9))
     warm = drive(road)
-    slip = known.rear / 80.0 - np.array([end(t.sideslip_rad) for t in (cold, warm)])
+    slip = figures.rear / 80.0 - np.array([end(t.sideslip_rad) for t in (cold, warm)])
     assert slip[1] / slip[0] == pytest.approx(1.2, rel=0.06)
     soon = drive(road, CarImperfections(cold_stiffness=0.2, warm_up_s=1.0))
     assert end(soon.sideslip_rad) == pytest.approx(end(warm.sideslip_rad), abs=1e-5)
@@ -179,34 +181,34 @@ def test_cold_tyres_stiffen_the_car_and_grow_warm() -> None:
 
 def test_an_accelerometer_feels_the_weight_that_a_banked_road_asks_for() -> None:
     """Straight across a slope the tyres hold the weight: ay = −g_y, and v̇y = 0."""
-    found = drive(straight(20.0, gravity_y_mps2=0.4))
-    assert end(found.ay_mps2) == pytest.approx(-0.4, abs=0.005)
-    assert abs(end(found.yaw_rate_rad_s)) < 1e-3
+    motion = drive(straight(20.0, gravity_y_mps2=0.4))
+    assert end(motion.ay_mps2) == pytest.approx(-0.4, abs=0.005)
+    assert abs(end(motion.yaw_rate_rad_s)) < 1e-3
     c = constants(SEDAN, 1.0)
     slip = handling(SEDAN).rear_slip * 0.4  # the rear axle's, which has no yaw rate to add
-    assert end(found.sideslip_rad) == pytest.approx(slip, rel=0.03)
+    assert end(motion.sideslip_rad) == pytest.approx(slip, rel=0.03)
     assert c.rear > 0
 
 
 def test_an_accelerometer_feels_the_weight_that_a_climb_asks_for() -> None:
     """At constant speed the drive force holds the weight: ax = −g_x."""
-    found = drive(straight(15.0, gravity_x_mps2=-0.5))
-    rate = np.gradient(found.vx_mps, 0.01)
-    assert end(found.ax_mps2 - rate) == pytest.approx(0.5, abs=0.005)
-    assert end(found.ax_mps2) == pytest.approx(0.5, abs=0.01)
+    motion = drive(straight(15.0, gravity_x_mps2=-0.5))
+    rate = np.gradient(motion.vx_mps, 0.01)
+    assert end(motion.ax_mps2 - rate) == pytest.approx(0.5, abs=0.005)
+    assert end(motion.ax_mps2) == pytest.approx(0.5, abs=0.01)
 
 
 def test_a_side_wind_is_held_by_the_tyres() -> None:
     """Going straight, wind and tyres cancel: ay is 0, and the axles share force and moment."""
     flaws = CarImperfections(side_force_area_m2=5.0, yawing_moment_volume_m3=3.0)
-    found = drive(straight(30.0, cross_wind_mps=10.0), flaws)
-    assert end(found.ay_mps2) == pytest.approx(0.0, abs=0.005)
+    motion = drive(straight(30.0, cross_wind_mps=10.0), flaws)
+    assert end(motion.ay_mps2) == pytest.approx(0.0, abs=0.005)
     pressure, body = 0.5 * 1.225 * 30.0 * 10.0, SEDAN.body
     force, moment = 5.0 * pressure, 3.0 * pressure
     rear = (body.front_axle_m * force - moment) / body.wheelbase_m  # to the right
     c = constants(SEDAN, 1.0)
     per_force = handling(SEDAN).rear_slip * GRAVITY_MPS2 / (2 * c.static_rear)
-    assert end(found.sideslip_rad) == pytest.approx(rear * per_force, rel=0.05)
+    assert end(motion.sideslip_rad) == pytest.approx(rear * per_force, rel=0.05)
 
 
 def test_a_slippery_side_shifts_no_line_but_the_slip() -> None:

@@ -52,17 +52,17 @@ def drive(car: VehicleParameters, on: Road, adhesion: float = 1.0, laps: float =
     return truth
 
 
-def assert_same_bits(one: Truth, other: Truth) -> None:
+def assert_same_bits(truth: Truth, other: Truth) -> None:
     for name in CHANNELS:
-        assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
-    assert one.lost_control_tick == other.lost_control_tick
+        assert getattr(truth, name).tobytes() == getattr(other, name).tobytes()
+    assert truth.lost_control_tick == other.lost_control_tick
 
 
-def worst_difference_deg(some: list[Truth], others: list[Truth]) -> float:
+def worst_difference_deg(truths: list[Truth], references: list[Truth]) -> float:
     worst = 0.0
-    for one, other in zip(some, others, strict=True):
-        n = min(len(one.vx_mps), len(other.vx_mps))
-        difference = np.degrees(one.sideslip_rad[:n] - other.sideslip_rad[:n])
+    for truth, other in zip(truths, references, strict=True):
+        n = min(len(truth.vx_mps), len(other.vx_mps))
+        difference = np.degrees(truth.sideslip_rad[:n] - other.sideslip_rad[:n])
         worst = max(worst, float(np.abs(difference).max()))
     return worst
 

@@ -113,8 +113,8 @@ def arctangents(y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.fl
 def test_arctangent_over_a_million_ratios() -> None:
     """Below 1e-12 rad: everywhere within the fitted interval, and mapped to all octants."""
     ratio = np.concatenate([np.linspace(2e-6, 1.0, 500_000), np.geomspace(1e-300, 1.0, 20_001)])
-    one = np.ones_like(ratio)
-    for y, x in ((ratio, one), (one, ratio), (ratio, -one), (-one, ratio), (-ratio, -one)):
+    ones = np.ones_like(ratio)
+    for y, x in ((ratio, ones), (ones, ratio), (ratio, -ones), (-ones, ratio), (-ratio, -ones)):
         assert np.abs(arctangents(y, x) - np.arctan2(y, x)).max() < 1e-12
 
 

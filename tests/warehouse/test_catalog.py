@@ -76,19 +76,19 @@ def test_two_roots_in_one_process_have_each_their_own_results(
     fill(other, tmp_path / "log.csv")
     update_grams(other)
     update_grams(other, feature_set="doubled")
-    found = contents(other)
+    results = contents(other)
     assert contents(warehouse) == before, "opening another root changed an open one"
     total = sum(20 * row for row in range(ROWS))
-    assert (before["counts"], found["counts"]) == ([(total,)], [(total // 2,)])
-    assert before["values"] == found["values"] == [(pytest.approx(total / 1000),)]
+    assert (before["counts"], results["counts"]) == ([(total,)], [(total // 2,)])
+    assert before["values"] == results["values"] == [(pytest.approx(total / 1000),)]
     assert before["grams"][0][2][0] == total
-    assert [(signals, sums[:2]) for _, signals, sums in found["grams"]] == [
+    assert [(signals, sums[:2]) for _, signals, sums in results["grams"]] == [
         ("ax,ax_doubled,sideslip", [total // 2, total]),
-        ("ax,sideslip", [total // 2, found["grams"][1][2][1]]),
+        ("ax,sideslip", [total // 2, results["grams"][1][2][1]]),
     ]
-    assert ("doubled" in before["sets"], "doubled" in found["sets"]) == (False, True)
-    assert before["identities"][0] != found["identities"][0]
-    assert (before["scale"], found["scale"]) == ([("0.001 m/s^2",)], [("0.002 m/s^2",)])
+    assert ("doubled" in before["sets"], "doubled" in results["sets"]) == (False, True)
+    assert before["identities"][0] != results["identities"][0]
+    assert (before["scale"], results["scale"]) == ([("0.001 m/s^2",)], [("0.002 m/s^2",)])
     with pytest.raises(QuestionError, match="no feature set is called 'doubled'"):
         update_grams(warehouse, feature_set="doubled")
 

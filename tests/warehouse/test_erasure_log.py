@@ -99,11 +99,11 @@ def test_status_reports_restored_rows_until_they_are_erased_again(
     tmp_path: Path, run_command: RunCommand
 ) -> None:
     restored(tmp_path, ErasureSubject("vehicle", "beta"))
-    found = run_command("status")
-    assert found.exit_code == 10
+    status = run_command("status")
+    assert status.exit_code == 10
     command = "fleet-slip forget --vehicle beta --now"
-    assert "the tables have rows of 1 erased name again" in found.stderr
-    assert command in found.stderr
+    assert "the tables have rows of 1 erased name again" in status.stderr
+    assert command in status.stderr
     assert run_command(*command.split()[1:]).exit_code == 0
     assert run_command("status").exit_code == 0
 

@@ -107,7 +107,7 @@ def drives(fleet: Warehouse) -> pa.Table:
 
 
 @pytest.mark.parametrize("text", LASTING)
-def test_what_stands_in_statements_means_what_was_written(drives: pa.Table, text: str) -> None:
+def test_a_predicate_in_a_statement_has_its_meaning(drives: pa.Table, text: str) -> None:
     predicate = parse_predicate(SIGNALS, text)
     with DATABASE.cursor() as database:
         database.register("drives", drives)
@@ -131,7 +131,7 @@ def test_anything_else_is_refused(text: str) -> None:
 @pytest.mark.parametrize("text", ["true) OR (true", "random() < 0.5", "EXISTS (SELECT 1)"])
 def test_every_way_in_passes_the_same_gate(fleet: Warehouse, text: str) -> None:
     published = manifest()
-    kept = published.model_copy(
+    stored = published.model_copy(
         update={"trained_on": published.trained_on.model_copy(update={"cohort": text})}
     )
     ways = (
@@ -141,7 +141,7 @@ def test_every_way_in_passes_the_same_gate(fleet: Warehouse, text: str) -> None:
         lambda: examine_drives(fleet, text),
         lambda: score(fleet, published, text),
         lambda: monitor(fleet, ModelVersion(1, published, "", fleet.catalog), text),
-        lambda: monitor(fleet, ModelVersion(1, kept, "", fleet.catalog)),
+        lambda: monitor(fleet, ModelVersion(1, stored, "", fleet.catalog)),
     )
     for way in ways:
         with pytest.raises(QuestionError, match="the predicate"):
@@ -177,7 +177,7 @@ def test_conditions_are_joined_as_they_are_meant() -> None:
         max_size=12,
     ).map(" ".join)
 )  # fmt: skip
-def test_whatever_passes_cannot_leave_its_parentheses(text: str) -> None:
+def test_accepted_predicates_stay_in_their_parentheses(text: str) -> None:
     try:
         predicate = parse_predicate(SIGNALS, text)
     except QuestionError:
@@ -205,11 +205,11 @@ def test_a_wrong_regular_expression_is_a_wrong_question(fleet: Warehouse, predic
             load_cohort(fleet, predicate, folding=folding)
 
 
-def test_what_fails_in_the_middle_of_an_answer_is_a_wrong_question() -> None:
+def test_a_query_that_fails_late_is_wrong_input() -> None:
     """pyarrow makes an OSError of what DuckDB says of a batch that is not the first."""
     query = "SELECT CAST(if(i < 9000, '1', 'spa') AS INTEGER) FROM range(10000) t(i)"
     with open_database() as database:
         batches = database.sql(query).to_arrow_reader(1000)
-        asked = parse_predicate(SIGNALS, "campaign = 1")
-        with pytest.raises(QuestionError, match="string 'spa'"), guarded_query(database, asked):
+        predicate = parse_predicate(SIGNALS, "campaign = 1")
+        with pytest.raises(QuestionError, match="string 'spa'"), guarded_query(database, predicate):
             assert not list(batches)

@@ -24,18 +24,20 @@ HASH = "5e" * 32
 
 @pytest.fixture(scope="module")
 def scenarios() -> tuple[Scenario, ...]:
-    """Those of one hash."""
+    """Return the blind drives of one hash."""
     return blind_scenarios(HASH, SHIPPED_CONFIGS)
 
 
 @given(drawn=st.binary(min_size=32, max_size=32))
 @settings(max_examples=3, deadline=None)  # half a second each
 def test_every_hash_has_a_set_of_its_own(scenarios: tuple[Scenario, ...], drawn: bytes) -> None:
-    others = blind_scenarios(drawn.hex(), SHIPPED_CONFIGS)
-    assert len({one.name for one in others}) == len(others) == 24
-    assert len({one.track.name for one in others}) == 8
-    assert {one.seed for one in others}.isdisjoint(one.seed for one in scenarios)
-    assert all(one.car.body.sprung_mass_kg > 0 for one in others), "every car can be"
+    drawn_set = blind_scenarios(drawn.hex(), SHIPPED_CONFIGS)
+    assert len({scenario.name for scenario in drawn_set}) == len(drawn_set) == 24
+    assert len({scenario.track.name for scenario in drawn_set}) == 8
+    assert {scenario.seed for scenario in drawn_set}.isdisjoint(
+        scenario.seed for scenario in scenarios
+    )
+    assert all(scenario.car.body.sprung_mass_kg > 0 for scenario in drawn_set), "every car can be"
 
 
 def test_signals_are_quantised_as_in_a_log_and_the_truth_is_exact() -> None:
@@ -43,9 +45,10 @@ def test_signals_are_quantised_as_in_a_log_and_the_truth_is_exact() -> None:
     (drive,) = simulate_drives(SIGNALS, [scenario])
     (log,) = simulate_logs(SIGNALS, scenario.batch().drives)
     for name in SIGNALS.inputs:
-        one = SIGNALS[name]
+        signal = SIGNALS[name]
         np.testing.assert_array_equal(
-            np.rint(drive.columns[one.column] / float(one.scale)), log.measurement.counts[name]
+            np.rint(drive.columns[signal.column] / float(signal.scale)),
+            log.measurement.counts[name],
         )
     np.testing.assert_array_equal(np.isfinite(drive.columns["gps_vx_mps"]), log.measurement.gps_fix)
     scale = float(SIGNALS["vy"].scale)
@@ -59,11 +62,11 @@ def test_the_truth_has_no_error_and_zero_has_that_of_the_angle(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """On the first road and the last, in all weathers."""
-    some = (*scenarios[:3], *scenarios[-3:])
+    selected = (*scenarios[:3], *scenarios[-3:])
     monkeypatch.setattr(
-        scenario_evaluation, "blind_scenarios", lambda sha256, _: {HASH: some}[sha256]
+        scenario_evaluation, "blind_scenarios", lambda sha256, _: {HASH: selected}[sha256]
     )
-    drives = simulate_drives(SIGNALS, some)
+    drives = simulate_drives(SIGNALS, selected)
     monkeypatch.setattr(
         scenario_evaluation, "simulate_drives", lambda _, scenarios: drives
     )  # the same again
@@ -83,21 +86,21 @@ def test_the_truth_has_no_error_and_zero_has_that_of_the_angle(
     assert rows["all"]["drives"] == 6
     assert [rows[name]["drives"] for name in ("dry", "wet", "ice")] == [2, 2, 2]
     assert all(row["results"]["right"]["rmse_deg"] == 0 for row in rows.values())
-    whole = rows["all"]["results"]["zero"]
-    assert whole["error_std_deg"] == pytest.approx(rows["all"]["sideslip_std_deg"], rel=1e-4)
+    zero_result = rows["all"]["results"]["zero"]
+    assert zero_result["error_std_deg"] == pytest.approx(rows["all"]["sideslip_std_deg"], rel=1e-4)
     print_parts(Evaluation({"estimators": estimators, "drives": judged}).parts())
-    told = capsys.readouterr().out
-    assert "switchback" in told
-    assert "0.000" in told
-    assert "silent@1" in told and "none" in told
+    output = capsys.readouterr().out
+    assert "switchback" in output
+    assert "0.000" in output
+    assert "silent@1" in output and "none" in output
 
 
 @pytest.mark.long
 def test_the_command_evaluates_and_writes_nothing(evaluated: Path, tmp_path: Path) -> None:
     root = shutil.copytree(evaluated, tmp_path / "data")
     before = {path for path in root.rglob("*") if "runs" not in path.parts}
-    told = answer(root, "evaluate", "smoke", "--blind")
-    rows = {row["name"]: row["results"] for row in told["drives"]}
+    document = answer(root, "evaluate", "smoke", "--blind")
+    rows = {row["name"]: row["results"] for row in document["drives"]}
     assert rows["all"]["smoke@1"]["coverage"] > 0.95
     assert rows["all"]["smoke@1"]["rmse_deg"] > rows["all"]["smoke@1"]["error_std_deg"] > 0
     assert {path for path in root.rglob("*") if "runs" not in path.parts} == before

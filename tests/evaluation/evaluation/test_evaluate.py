@@ -48,13 +48,13 @@ def root(tmp_path_factory: pytest.TempPathFactory, evaluated: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def again(root: Path) -> Any:
-    """What an evaluation says that was done before."""
+    """The content of an evaluation that was done before."""
     return answer(root, "evaluate", "smoke", *SCENARIOS)
 
 
 def test_evaluating_again_changes_nothing(root: Path, evaluated: Path, again: Any) -> None:
     assert again["number"] == 1
-    before, after = (Warehouse(LocalFolder(one)).logs.snapshot() for one in (evaluated, root))
+    before, after = (Warehouse(LocalFolder(copy)).logs.snapshot() for copy in (evaluated, root))
     assert after.version == before.version
 
 
@@ -79,19 +79,19 @@ def test_the_model_is_shown_together_with_filters_without_and_with_gps(again: An
 def test_an_evaluation_of_another_process_is_not_stored_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kept = DocumentFolder(LocalFolder(tmp_path), "evaluations")
+    documents = DocumentFolder(LocalFolder(tmp_path), "evaluations")
     inventory = DocumentFolder.inventory
 
     def overtaken(folder: DocumentFolder) -> Inventory:
         before = inventory(folder)
         monkeypatch.undo()
-        store_evaluation(kept, {"models": 5})
+        store_evaluation(documents, {"models": 5})
         return before
 
     monkeypatch.setattr(DocumentFolder, "inventory", overtaken)
-    assert store_evaluation(kept, {"models": 5}).number == 1
-    assert store_evaluation(kept, {"models": 6}).number == 2
-    assert store_evaluation(kept, {"models": 6}).number == 2
+    assert store_evaluation(documents, {"models": 5}).number == 1
+    assert store_evaluation(documents, {"models": 6}).number == 2
+    assert store_evaluation(documents, {"models": 6}).number == 2
 
 
 def test_no_model_is_trained_on_scenarios(root: Path) -> None:
@@ -105,15 +105,15 @@ def test_no_model_is_trained_on_scenarios(root: Path) -> None:
 def test_a_cohort_excludes_test_drives_by_default(root: Path, tmp_path: Path) -> None:
     copy = tmp_path / "data"
     shutil.copytree(root, copy)
-    asked = ("--cohort", "speed_factor > 0.1")
-    assert answer(copy, "publish", "fast", *asked, "--models", "table1")["version"] == 1
+    options = ("--cohort", "speed_factor > 0.1")
+    assert answer(copy, "publish", "fast", *options, "--models", "table1")["version"] == 1
     assert fleet_slip.open(copy).models.get("fast").manifest.trained_on.drives == 8
     with pytest.raises(DataError, match="has 2 in the cohort"):  # and not for its test drives
         answer(copy, "monitor", "fast")
-    assert answer(copy, "quality", *asked)["drives"] == 8
-    every = answer(copy, "score", "fast", *asked)["rows"]
+    assert answer(copy, "quality", *options)["drives"] == 8
+    all_rows = answer(copy, "score", "fast", *options)["rows"]
     tests = answer(copy, "score", "fast", "--cohort", "source = 'scenario'")["rows"]
-    assert answer(copy, "score", "fast", "--cohort", "source <> ''")["rows"] == every + tests
+    assert answer(copy, "score", "fast", "--cohort", "source <> ''")["rows"] == all_rows + tests
 
 
 def test_a_changed_scenario_is_refused(root: Path, tmp_path: Path) -> None:
@@ -139,31 +139,32 @@ def test_views_contain_test_drives_only_by_source(root: Path) -> None:
         ((shown,),) = fleet.sql(f"{hidden} WHERE source IS NOT NULL").fetchall()
         assert shown > 8
     asking = f"{count} WHERE source = 'scenario'"
-    asked = fleet.sql(asking).fetchall()
+    rows = fleet.sql(asking).fetchall()
     with fleet.session() as fleet_alone, fleet.session(asking) as everything:
         assert fleet_alone.sql(asking).fetchall() == [(0,)]
-        assert everything.sql(asking).fetchall() == asked != [(0,)]
+        assert everything.sql(asking).fetchall() == rows != [(0,)]
     assert answer(root, "sql", count) == [{"count_star()": 8}]
-    assert answer(root, "sql", asking) == [{"count_star()": asked[0][0]}]
+    assert answer(root, "sql", asking) == [{"count_star()": rows[0][0]}]
 
 
 def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path, again: Any) -> None:
     """SQL measures against the noisy label, here the truth counts: 0.03 degrees between them."""
     manifest = Registry(LocalFolder(root), CATALOG).resolve("smoke").manifest
     in_sql = score(Warehouse(LocalFolder(root)), manifest, "drive_id = 'scenario-nominal'")
-    one = again["scenarios"][0]
-    here = one["results"]["smoke@1"]
-    assert here["rows"] == in_sql.rows == one["truth"]["rows"]
-    assert here["error_mean_deg"] == pytest.approx(in_sql.error_mean_deg, abs=0.001)
+    scenario = again["scenarios"][0]
+    result = scenario["results"]["smoke@1"]
+    assert result["rows"] == in_sql.rows == scenario["truth"]["rows"]
+    assert result["error_mean_deg"] == pytest.approx(in_sql.error_mean_deg, abs=0.001)
     label_noise_deg = np.degrees(load_scenario("nominal", SHIPPED_CONFIGS).sensors.sideslip_std_rad)
-    expected = np.hypot(here["error_std_deg"], label_noise_deg)
+    expected = np.hypot(result["error_std_deg"], label_noise_deg)
     assert in_sql.error_std_deg == pytest.approx(expected, rel=0.01)
 
 
 def test_stability_is_lost_on_the_slippery_road_alone(again: Any) -> None:
-    content = {one["name"]: one for one in again["scenarios"]}
+    content = {scenario["name"]: scenario for scenario in again["scenarios"]}
     sections = {
-        name: [section["name"] for section in one["sections"]] for name, one in content.items()
+        name: [section["name"] for section in scenario["sections"]]
+        for name, scenario in content.items()
     }
     assert "unstable" not in sections["nominal"]
     assert "unstable" in sections["adhesion_0_4"]
@@ -174,10 +175,12 @@ def test_stability_is_lost_on_the_slippery_road_alone(again: Any) -> None:
 
 
 def test_a_missing_signal_lowers_the_coverage_of_models_with_it(again: Any) -> None:
-    one = next(one for one in again["scenarios"] if one["name"] == "wheel_missing")
-    assert one["results"]["smoke@1/1"]["coverage"] == 1
-    expected = 60 / one["truth"]["duration_s"]
-    assert one["results"]["smoke@1/4"]["coverage"] == pytest.approx(expected, abs=0.001)
+    scenario = next(
+        scenario for scenario in again["scenarios"] if scenario["name"] == "wheel_missing"
+    )
+    assert scenario["results"]["smoke@1/1"]["coverage"] == 1
+    expected = 60 / scenario["truth"]["duration_s"]
+    assert scenario["results"]["smoke@1/4"]["coverage"] == pytest.approx(expected, abs=0.001)
 
 
 def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
@@ -228,8 +231,8 @@ def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None
     with connect(root, query="SELECT source FROM log") as database:
         alone = read_drive(SIGNALS, database, scenario.drive_id)
     expected = kalman.estimate(alone.signals, scenario.car, kalman.FilterNoise())
-    found = FilterEstimate(FILTERS[0], FILTERS[0].default)(drive)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    estimates = FilterEstimate(FILTERS[0], FILTERS[0].default)(drive)
+    np.testing.assert_allclose(estimates, expected, rtol=0, atol=1e-12)
 
 
 ROWS = 1000
@@ -262,9 +265,9 @@ def run(
     return evaluated
 
 
-def standing(one: EvaluatedDrive[TestDrive], estimator: str = "ours") -> dict[str, Any]:
-    (found,) = rank([one], estimator, excluded=())["standings"]
-    return dict(found)
+def standing(drive: EvaluatedDrive[TestDrive], estimator: str = "ours") -> dict[str, Any]:
+    (standing_,) = rank([drive], estimator, excluded=())["standings"]
+    return dict(standing_)
 
 
 def test_the_smallest_error_wins() -> None:
@@ -276,13 +279,18 @@ def test_the_smallest_error_wins() -> None:
 
 
 def test_satellite_navigation_does_not_compete() -> None:
-    found = rank([run(ours=0.3, kalman=0.1, ekf=0.4)], "ours", excluded={"kalman"})
-    assert found["won"] == 1
+    ranking = rank([run(ours=0.3, kalman=0.1, ekf=0.4)], "ours", excluded={"kalman"})
+    assert ranking["won"] == 1
 
 
 def test_an_estimator_with_low_coverage_neither_wins_nor_is_close() -> None:
-    one = standing(run(ours=(0.1, 11), ekf=0.2))
-    assert (one["winner"], one["rmse_deg"], one["ratio"], one["won"]) == ("ekf", None, None, False)
+    result = standing(run(ours=(0.1, 11), ekf=0.2))
+    assert (result["winner"], result["rmse_deg"], result["ratio"], result["won"]) == (
+        "ekf",
+        None,
+        None,
+        False,
+    )
     assert standing(run(ours=(0.1, 10), ekf=0.2))["won"]
     nobody = standing(run(ours=(0.1, ROWS), ekf=(0.1, ROWS)))
     assert (nobody["winner"], nobody["won"], nobody["ratio"]) == (None, False, None)
@@ -290,14 +298,14 @@ def test_an_estimator_with_low_coverage_neither_wins_nor_is_close() -> None:
 
 def test_drives_that_differ_in_satellite_navigation_alone_count_once() -> None:
     names = ("gps_clear", "nominal", "gps_urban", "wheel_missing", "gps_tunnel", "noise_doubled")
-    found = rank(
+    ranking = rank(
         [run(load_scenario(name, SHIPPED_CONFIGS), ours=0.1, ekf=0.2) for name in names],
         "ours",
         excluded=(),
     )
-    same = [one["same_as"] for one in found["standings"]]
+    same = [entry["same_as"] for entry in ranking["standings"]]
     assert same == [None, "gps_clear", "gps_clear", None, "gps_clear", None]
-    assert (found["drives"], found["won"]) == (3, 3)
+    assert (ranking["drives"], ranking["won"]) == (3, 3)
 
 
 def test_wins_and_close_losses_are_counted_apart() -> None:
@@ -306,6 +314,6 @@ def test_wins_and_close_losses_are_counted_apart() -> None:
         run(nominal.model_copy(update={"seed": seed}), ours=error, ekf=0.2)
         for seed, error in enumerate((0.1, 0.2, 0.24, 0.26))
     ]
-    found = rank(runs, "ours", excluded=())
-    assert (found["won"], found["close"]) == (2, 1), "a tie is won, 1.2 is close and 1.3 is not"
-    assert [one["won"] for one in found["standings"]] == [True, True, False, False]
+    ranking = rank(runs, "ours", excluded=())
+    assert (ranking["won"], ranking["close"]) == (2, 1), "a tie is won, 1.2 is close and 1.3 is not"
+    assert [entry["won"] for entry in ranking["standings"]] == [True, True, False, False]

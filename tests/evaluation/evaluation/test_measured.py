@@ -49,11 +49,11 @@ def drives_of(held_out: Segments) -> list[int]:
     return sorted({int(name.removeprefix("drive-")) for name, _ in held_out})
 
 
-def test_whole_drives_are_held_out_with_all_of_their_trip() -> None:
+def test_drives_are_held_out_with_all_of_their_trip() -> None:
     drives = [a_drive(n, trip=f"trip-{n // 2}") for n in range(6)]
-    assert [drives_of(one) for one in folds_of(drives)] == [[0, 1], [2, 3], [4, 5]]
+    assert [drives_of(fold) for fold in folds_of(drives)] == [[0, 1], [2, 3], [4, 5]]
     many = folds_of([a_drive(n) for n in range(20)])
-    assert sorted(drive for one in many for drive in drives_of(one)) == [*range(20)]
+    assert sorted(drive for fold in many for drive in drives_of(fold)) == [*range(20)]
     assert len(many) == 8
 
 
@@ -67,8 +67,8 @@ def test_quarters_of_few_drives_are_held_out() -> None:
 
 def test_kinds_of_driving_are_held_out_as_a_whole() -> None:
     drives = [a_drive(n, speed_mps=speed) for n, speed in enumerate((5.0, 20.0, 24.0))]
-    found = {kind: drives_of(one) for kind, one in folds_by_kind(drives).items()}
-    assert found == {
+    drives_by_kind = {kind: drives_of(fold) for kind, fold in folds_by_kind(drives).items()}
+    assert drives_by_kind == {
         "below 8 m/s, ay 1 to 2.5 m/s²": [0],
         "15 to 25 m/s, ay 1 to 2.5 m/s²": [1, 2],
     }
@@ -88,7 +88,7 @@ def test_a_missing_acceleration_is_derived_from_wheel_speeds() -> None:
 
 
 @pytest.fixture(scope="module")
-def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def measured_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data root with drives that no filter can serve, and a model of some of them."""
     folder = tmp_path_factory.mktemp("measured")
     root = folder / "data"
@@ -97,37 +97,39 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_without_a_vehicle_only_models_are_evaluated(own: Path) -> None:
+def test_without_a_vehicle_only_models_are_evaluated(measured_root: Path) -> None:
     four = "vehicle_id <> 'car-0' AND vehicle_id <> 'car-5'"
-    told = fleet_slip.open(own).evaluation.evaluate_measured("own", four)
-    assert "No filter was evaluated" in str(told)
-    assert f"stored as evaluations/measured/{told.number}.json" in str(told)
-    found = told.content
-    assert found["vehicle"] is None
-    assert found["estimators"]["own@1"]["told"] == "chosen and fitted without held-out rows"
-    assert found["estimators"]["own@1"]["rmse_deg"] < 0.05
-    assert {name for name in found["estimators"] if "/" not in name} == {"own@1"}
-    assert (len(found["drives"]), found["parts"], found["parts_of"]) == (4, 4, "drives")
-    assert "±: standard error over drives; worst: RMSE of the worst drive" in str(told)
-    assert 0 < found["estimators"]["own@1"]["rmse_standard_error_deg"] < 0.01
-    assert found["estimators"]["own@1"]["worst_drive"] in [one["name"] for one in found["drives"]]
+    evaluation = fleet_slip.open(measured_root).evaluation.evaluate_measured("own", four)
+    assert "No filter was evaluated" in str(evaluation)
+    assert f"stored as evaluations/measured/{evaluation.number}.json" in str(evaluation)
+    content = evaluation.content
+    assert content["vehicle"] is None
+    assert content["estimators"]["own@1"]["told"] == "chosen and fitted without held-out rows"
+    assert content["estimators"]["own@1"]["rmse_deg"] < 0.05
+    assert {name for name in content["estimators"] if "/" not in name} == {"own@1"}
+    assert (len(content["drives"]), content["parts"], content["parts_of"]) == (4, 4, "drives")
+    assert "±: standard error over drives; worst: RMSE of the worst drive" in str(evaluation)
+    assert 0 < content["estimators"]["own@1"]["rmse_standard_error_deg"] < 0.01
+    assert content["estimators"]["own@1"]["worst_drive"] in [
+        result["name"] for result in content["drives"]
+    ]
 
 
-def test_a_model_of_other_drives_is_evaluated_as_published(own: Path) -> None:
-    done = done_on(own, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'", "--json")
+def test_a_model_of_other_drives_is_evaluated_as_published(measured_root: Path) -> None:
+    done = done_on(measured_root, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'", "--json")
     assert done.json["estimators"]["own@1"]["told"] == "as published"
     (lines,) = [line for line in done.stderr.splitlines() if "table1/2" in line]
     assert lines == (
         "table1/2, table1/3, table1/4: not evaluated: these drives lack steering_wheel."
     )
-    two = done_on(own, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'")
+    two = done_on(measured_root, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'")
     assert "±: standard error over quarters" in two.stdout + two.stderr
-    refused = run_on(own, "select", "--model", "ax,steering_wheel")
+    refused = run_on(measured_root, "select", "--model", "ax,steering_wheel")
     assert "can be fitted: these drives lack steering_wheel." in refused.stderr
 
 
 def test_an_error_of_a_published_model_stops_the_evaluation(
-    own: Path, monkeypatch: pytest.MonkeyPatch
+    measured_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Missing estimates would pass for a model that does not compete."""
 
@@ -135,13 +137,13 @@ def test_an_error_of_a_published_model_stops_the_evaluation(
         raise DataError("the drive has too many rows for windows.")
 
     monkeypatch.setattr(measured_evaluation, "predict_drive", fail)
-    done = run_on(own, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'")
+    done = run_on(measured_root, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'")
     assert done.exit_code == DataError.exit_code
     assert "too many rows" in done.stderr
 
 
 def test_a_model_that_cannot_be_fitted_is_reported_with_the_reason(
-    own: Path, monkeypatch: pytest.MonkeyPatch
+    measured_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train = Learner.train
 
@@ -151,9 +153,9 @@ def test_a_model_that_cannot_be_fitted_is_reported_with_the_reason(
         return train(learner, *words)
 
     monkeypatch.setattr(Learner, "train", fail)
-    fleet = fleet_slip.open(own)
+    fleet = fleet_slip.open(measured_root)
     fleet.models.publish("three", fleet.cohort().select(model="ax,ay,yaw_rate"), force=True)
-    done = done_on(own, "evaluate", "three", "--cohort", "vehicle_id >= 'car-2'")
+    done = done_on(measured_root, "evaluate", "three", "--cohort", "vehicle_id >= 'car-2'")
     assert "three@1: not evaluated: the training drives have no ax." in done.stderr
 
 
@@ -170,7 +172,7 @@ def test_a_choice_on_the_test_drives_understates_the_error(tmp_path: Path) -> No
     sizes = {"ax": 1, "ay": 2, "r": 0.1, "steer": 0.3, "left": 0.02, "right": 0.02, "beta": 0.02}
     columns: dict[str, Any] = {
         "t": list(np.tile(np.arange(rows) / 100, cars)),
-        "car": list(np.repeat([f"car-{one}" for one in range(cars)], rows)),
+        "car": list(np.repeat([f"car-{item}" for item in range(cars)], rows)),
     }
     for name, size in sizes.items():  # nothing has to do with the label: each drive is one draw
         of_drive = np.repeat(generator.standard_normal(cars), rows)
@@ -187,9 +189,11 @@ def test_a_choice_on_the_test_drives_understates_the_error(tmp_path: Path) -> No
     fleet.models.publish("again", selection, force=True)
     chosen = fleet_slip.open(root).models.get("again").manifest.signals
     fleet.models.publish("once", fleet.cohort().select(model=",".join(chosen)), force=True)
-    found = fleet_slip.open(root).evaluation.evaluate_measured("again", "true", ["once"]).content
+    evaluation = (
+        fleet_slip.open(root).evaluation.evaluate_measured("again", "true", ["once"]).content
+    )
     spread_deg = float(np.degrees(np.std(columns["beta"])))
-    errors = {name: one["rmse_deg"] for name, one in found["estimators"].items()}
+    errors = {name: item["rmse_deg"] for name, item in evaluation["estimators"].items()}
     assert errors["once@1"] < 0.7 * spread_deg
     assert errors["again@1"] > spread_deg
     assert selection.nested is not None
@@ -197,19 +201,19 @@ def test_a_choice_on_the_test_drives_understates_the_error(tmp_path: Path) -> No
     assert selection.winner.model.pooled.rmse_deg < selection.nested.figures.rmse_deg
     assert f"{errors['again@1']:.4f} deg on held-out drives" in str(selection)
     assert fleet.cohort().select(**search).nested is None, "only for publications"
-    columns_of_parts = found["estimators"]["again@1"]["found"]
-    assert len({tuple(one) for one in columns_of_parts}) > 1
+    columns_of_parts = evaluation["estimators"]["again@1"]["found"]
+    assert len({tuple(item) for item in columns_of_parts}) > 1
 
 
-def test_gram_rows_of_quarters_add_up_to_those_of_drives(own: Path) -> None:
-    fleet = fleet_slip.open(own)
+def test_gram_rows_of_quarters_add_up_to_those_of_drives(measured_root: Path) -> None:
+    fleet = fleet_slip.open(measured_root)
     cohort = load_cohort(fleet.warehouse, "true")
     drives = read_measured_drives(fleet.warehouse, cohort)
     request = SelectionRequest(model="ax,ay,yaw_rate")
     learner = Learner.prepare(fleet.warehouse, request, "true", drives)
-    (whole,), (quarters,) = cohort.tables, learner.quarters.tables
-    assert len(quarters) == 4 * len(whole)
-    assert quarters.total() == whole.total()
+    (full,), (quarters,) = cohort.tables, learner.quarters.tables
+    assert len(quarters) == 4 * len(full)
+    assert quarters.total() == full.total()
     of_quarters = learner.choose(frozenset((drive.name, 3) for drive in drives))
     assert of_quarters.winner.model.pooled.rows == 6 * 375
 
@@ -227,9 +231,9 @@ min_drives = 4
 """
 
 
-def test_quarters_of_drives_do_not_count_as_drives(own: Path, tmp_path: Path) -> None:
+def test_quarters_of_drives_do_not_count_as_drives(measured_root: Path, tmp_path: Path) -> None:
     """An evaluation of two drives must choose by the recipe that publish has for two drives."""
-    fleet, predicate = fleet_slip.open(own), "vehicle_id < 'car-2'"
+    fleet, predicate = fleet_slip.open(measured_root), "vehicle_id < 'car-2'"
     (tmp_path / "searches.toml").write_text(SEARCHES)
     request = SelectionRequest(models=str(tmp_path / "searches.toml"))
     drives = read_measured_drives(fleet.warehouse, load_cohort(fleet.warehouse, predicate))
@@ -278,8 +282,8 @@ def test_rows_at_standstill_are_judged_nowhere(tmp_path: Path) -> None:
         ("--cohort", "true", "--blind"),
     ],
 )
-def test_conflicting_options_are_refused(own: Path, words: tuple[str, ...]) -> None:
-    done = run_on(own, "evaluate", "own", *words)
+def test_conflicting_options_are_refused(measured_root: Path, words: tuple[str, ...]) -> None:
+    done = run_on(measured_root, "evaluate", "own", *words)
     assert done.exit_code == 2
     assert "leave out" in done.stderr
 
@@ -289,8 +293,10 @@ def test_filters_compete_in_the_car_of_a_file_and_in_one_that_is_identified(
 ) -> None:
     judged: list[float] = []
 
-    def untuned(_: object, start: Any, *rest: Any) -> TuningResult[Any]:
-        judged.append(float(np.mean([np.isfinite(one.sideslip_rad).mean() for one in rest[1]])))
+    def untuned(_: object, start: Any, *arguments: Any) -> TuningResult[Any]:
+        judged.append(
+            float(np.mean([np.isfinite(drive.sideslip_rad).mean() for drive in arguments[1]]))
+        )
         return TuningResult(start, 0.0)
 
     monkeypatch.setattr(filters, "tune", untuned)
@@ -299,10 +305,10 @@ def test_filters_compete_in_the_car_of_a_file_and_in_one_that_is_identified(
         "identify",
         lambda measured, *_: IdentifiedVehicle(vehicle_with_fit(measured), ekf.EkfNoise(), 0.0),
     )
-    one = "drive_id = 'smoke-2024-05-01-0001'"
-    found = fleet_slip.open(smoke_copy).evaluation.evaluate_measured("smoke", one).content
-    assert (found["vehicle"], found["parts_of"]) == ("d_class_sedan", "time")
-    errors = {name: one["rmse_deg"] for name, one in found["estimators"].items()}
+    item = "drive_id = 'smoke-2024-05-01-0001'"
+    evaluation = fleet_slip.open(smoke_copy).evaluation.evaluate_measured("smoke", item).content
+    assert (evaluation["vehicle"], evaluation["parts_of"]) == ("d_class_sedan", "time")
+    errors = {name: item["rmse_deg"] for name, item in evaluation["estimators"].items()}
     assert {"kinematic", "ekf_tuned", "ekf_identified", "kalman_identified"} <= {*errors}
     assert errors["ekf_tuned"] < 0.06, "the label's noise is 0.029"
     assert list(errors.values()) == sorted(errors.values())

@@ -69,9 +69,9 @@ motions = {
 def test_force_is_that_of_a_fiala_tyre(vx: float, vy: float, r: float, steer: float) -> None:
     alpha = np.arctan2(vy + FRONT_M * r, vx) - steer
     expected = np.cos(steer) * fiala(alpha, 9e4, 7e3)
-    found = lateral_force(vx, vy, r, steer, FRONT_M, 9e4, 7e3)
+    force = lateral_force(vx, vy, r, steer, FRONT_M, 9e4, 7e3)
     if np.cos(alpha) * np.hypot(vx, vy + FRONT_M * r) > 5.0:
-        assert found.force == pytest.approx(expected, rel=1e-9, abs=1e-6)
+        assert force.force == pytest.approx(expected, rel=1e-9, abs=1e-6)
 
 
 @given(**motions)
@@ -82,10 +82,14 @@ def test_derivatives_are_those_of_finite_differences(
         return rates(state[0], state[1], state[2], steer, AT_REST, CHASSIS)
 
     state = np.array([vx, vy, r])
-    found = at(state)
+    derivatives = at(state)
     h = 1e-6
     for i, (ay_slope, yaw_slope) in enumerate(
-        [(found.ay_vx, found.yaw_vx), (found.ay_vy, found.yaw_vy), (found.ay_r, found.yaw_r)]
+        [
+            (derivatives.ay_vx, derivatives.yaw_vx),
+            (derivatives.ay_vy, derivatives.yaw_vy),
+            (derivatives.ay_r, derivatives.yaw_r),
+        ]
     ):
         step = np.eye(3)[i] * h
         above = at(state + step)
@@ -168,8 +172,8 @@ def test_converges_on_data_of_its_own_model_near_the_limit() -> None:
 def test_agrees_with_analytic_steady_cornering() -> None:
     drive, _ = drive_of_the_model(np.full(3000, 0.001), np.full(3000, 20.0))
     expected = steady_sideslip_rad(CAR, 20.0, drive.yaw_rate_rad_s[-1])
-    found = ekf.estimate(drive, CAR, EkfNoise())[-1]
-    assert found == pytest.approx(expected, rel=0.02), "brush tyres are linear at small slip"
+    estimate = ekf.estimate(drive, CAR, EkfNoise())[-1]
+    assert estimate == pytest.approx(expected, rel=0.02), "brush tyres are linear at small slip"
 
 
 def test_a_bias_of_the_accelerometer_is_found() -> None:

@@ -1,4 +1,4 @@
-"""What every estimator must do alike: on the simulated car, in a mirror, at rest, with gaps."""
+"""Properties of all estimators: on the simulated car, in a mirror, at rest, with gaps."""
 
 import re
 from collections.abc import Callable
@@ -46,9 +46,9 @@ def test_follows_the_simulated_car(name: str) -> None:
 def test_mirrored_drive_gives_mirrored_sideslip(name: str) -> None:
     estimate, parameters = ESTIMATORS[name]
     drive = noisy(slalom(CAR, 2000)[0], seed=1)
-    found = estimate(drive, CAR, parameters)
+    angles = estimate(drive, CAR, parameters)
     other = estimate(mirrored(drive), CAR, parameters)
-    np.testing.assert_allclose(other, -found, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(other, -angles, rtol=0, atol=1e-12)
 
 
 @ALL
@@ -71,10 +71,10 @@ def test_a_gap_of_the_sensors_is_bridged(name: str) -> None:
             for field in ("ax_mps2", "ay_mps2", "yaw_rate_rad_s", "wheel_rl_rad_s", "steer_fl_rad")
         },
     )
-    found, expected = (estimate(each, CAR, parameters) for each in (gappy, drive))
-    assert np.isfinite(found).all()
-    assert np.abs(found - expected).max() < 0.02
-    np.testing.assert_array_equal(found[:900], expected[:900])
+    angles, expected = (estimate(signals, CAR, parameters) for signals in (gappy, drive))
+    assert np.isfinite(angles).all()
+    assert np.abs(angles - expected).max() < 0.02
+    np.testing.assert_array_equal(angles[:900], expected[:900])
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_a_gap_of_the_sensors_is_bridged(name: str) -> None:
 )
 def test_an_absent_sensor_is_named(field: str, message: str) -> None:
     drive = slalom(CAR, 50)[0]
-    absent = {one: np.full(50, np.nan) for one in vars(drive) if re.fullmatch(field, one)}
+    absent = {name: np.full(50, np.nan) for name in vars(drive) if re.fullmatch(field, name)}
     with pytest.raises(DataError, match=message):
         ekf.estimate(replace(drive, **absent), CAR, ekf.EkfNoise())
 
@@ -91,9 +91,9 @@ def test_an_absent_sensor_is_named(field: str, message: str) -> None:
 @pytest.mark.parametrize("fields", ["steer_fl_rad", "steer_fr_rad", "gps_vx_mps gps_vy_mps"])
 def test_one_front_wheel_angle_suffices_and_gps_is_not_read(fields: str) -> None:
     drive = slalom(CAR, 500)[0]
-    one = replace(drive, **dict.fromkeys(fields.split(), np.full(500, np.nan)))
-    found, expected = (ekf.estimate(each, CAR, ekf.EkfNoise()) for each in (one, drive))
-    np.testing.assert_array_equal(found, expected)
+    reduced = replace(drive, **dict.fromkeys(fields.split(), np.full(500, np.nan)))
+    angles, expected = (ekf.estimate(signals, CAR, ekf.EkfNoise()) for signals in (reduced, drive))
+    np.testing.assert_array_equal(angles, expected)
 
 
 @ALL

@@ -56,12 +56,12 @@ def test_the_start_depends_on_measures_alone() -> None:
 def test_an_identified_car_estimates_better_than_one_with_usual_tyres(
     drive: LabelledDrive, identified: IdentifiedVehicle
 ) -> None:
-    found = identified
+    vehicle = identified
     before = rmse_deg(
         ekf.estimate(drive.signals, vehicle_with_fit(MEASURED), ekf.EkfNoise()), drive
     )
-    assert rmse_deg(ekf.estimate(drive.signals, found.car, found.noise), drive) < 0.7 * before
-    assert found.held_out_rad is None
+    assert rmse_deg(ekf.estimate(drive.signals, vehicle.car, vehicle.noise), drive) < 0.7 * before
+    assert vehicle.held_out_rad is None
 
 
 def test_identifies_steering_ratio_offset_and_roll_from_a_steering_wheel(
@@ -77,15 +77,15 @@ def test_identifies_steering_ratio_offset_and_roll_from_a_steering_wheel(
         steering_wheel_rad=18 * (road + 0.01),
         ay_mps2=1.08 * exact.ay_mps2 + 0.2,
     )
-    found = identify(MEASURED, [replace(drive, signals=signals)], executor)
-    assert found.car.steering.ratio == pytest.approx(18, rel=0.05)
-    sensors = found.noise.sensors
+    vehicle = identify(MEASURED, [replace(drive, signals=signals)], executor)
+    assert vehicle.car.steering.ratio == pytest.approx(18, rel=0.05)
+    sensors = vehicle.noise.sensors
     assert sensors.steer_offset_rad - bias.steer_offset_rad == pytest.approx(0.01, abs=0.001)
     assert sensors.ay_gain / bias.ay_gain == pytest.approx(1.08, rel=0.001)
     expected = 0.2 + 1.08 * bias.ay_offset_mps2
     assert sensors.ay_offset_mps2 == pytest.approx(expected, abs=0.001)
-    assert found.fit_rad < 1.2 * identified.fit_rad
-    assert "steer_gain" not in {*found.at_bounds, *found.not_identifiable}
+    assert vehicle.fit_rad < 1.2 * identified.fit_rad
+    assert "steer_gain" not in {*vehicle.at_bounds, *vehicle.not_identifiable}
 
 
 def test_parameters_at_bounds_and_not_identifiable_ones_are_reported(
@@ -101,9 +101,9 @@ def test_parameters_at_bounds_and_not_identifiable_ones_are_reported(
 
 def test_one_speed_for_all_wheels_gives_no_yaw_rate(drive: LabelledDrive) -> None:
     speed = (drive.signals.wheel_rl_rad_s + drive.signals.wheel_rr_rad_s) / 2
-    one = replace(drive.signals, wheel_rl_rad_s=speed, wheel_rr_rad_s=speed)
+    signals = replace(drive.signals, wheel_rl_rad_s=speed, wheel_rr_rad_s=speed)
     two = rmse_deg(ekf.estimate(drive.signals, CAR, ekf.EkfNoise()), drive)
-    assert rmse_deg(ekf.estimate(one, CAR, ekf.EkfNoise()), drive) < 2 * two
+    assert rmse_deg(ekf.estimate(signals, CAR, ekf.EkfNoise()), drive) < 2 * two
 
 
 def test_the_held_out_error_is_that_of_a_fit_without_the_drive(
@@ -111,9 +111,9 @@ def test_the_held_out_error_is_that_of_a_fit_without_the_drive(
 ) -> None:
     drive = drive.beginning(2000)
     wrong = replace(drive, name="wrong", sideslip_rad=drive.sideslip_rad + np.radians(1))
-    found = identify_held_out(MEASURED, [drive, wrong], executor)
-    assert found.held_out_rad is not None
-    assert np.degrees(found.held_out_rad) > 0.8 > np.degrees(found.fit_rad)
+    result = identify_held_out(MEASURED, [drive, wrong], executor)
+    assert result.held_out_rad is not None
+    assert np.degrees(result.held_out_rad) > 0.8 > np.degrees(result.fit_rad)
 
 
 def test_drives_without_a_label_are_refused(drive: LabelledDrive, executor: Executor) -> None:
@@ -148,16 +148,16 @@ def valley(drive: DriveSignals, car: VehicleParameters, p: Parameters) -> FloatA
 def test_finds_the_optimum_of_a_valley_with_a_nested_and_a_bounded_parameter(
     executor: Executor,
 ) -> None:
-    found = tune(valley, Parameters(), ("a", "inner.b"), [labelled(1)], CAR, executor)
-    assert found.parameters.a == pytest.approx(3, rel=0.05)
-    assert found.parameters.inner.b == pytest.approx(0.2, rel=0.05)
-    assert found.rmse_rad == pytest.approx(0.01, rel=0.1)
+    result = tune(valley, Parameters(), ("a", "inner.b"), [labelled(1)], CAR, executor)
+    assert result.parameters.a == pytest.approx(3, rel=0.05)
+    assert result.parameters.inner.b == pytest.approx(0.2, rel=0.05)
+    assert result.rmse_rad == pytest.approx(0.01, rel=0.1)
 
 
 def test_a_parameter_without_effect_stays(executor: Executor) -> None:
     noise = FilterNoise(gps_vx_std_mps=0.07)
-    found = tune(kalman.estimate, noise, ("bias_std_mps2",), [labelled(2)], CAR, executor)
-    assert found.parameters.gps_vx_std_mps == 0.07
+    result = tune(kalman.estimate, noise, ("bias_std_mps2",), [labelled(2)], CAR, executor)
+    assert result.parameters.gps_vx_std_mps == 0.07
 
 
 def test_tuning_makes_up_for_wrong_noise_and_never_makes_worse(executor: Executor) -> None:
@@ -166,11 +166,11 @@ def test_tuning_makes_up_for_wrong_noise_and_never_makes_worse(executor: Executo
     names = ("ay_std_mps2", "gps_vy_std_mps")
     before = rmse_rad(lambda d: kalman.estimate(d.signals, CAR, wrong), drives, executor)
     right = rmse_rad(lambda d: kalman.estimate(d.signals, CAR, FilterNoise()), drives, executor)
-    found = tune(kalman.estimate, wrong, names, drives, CAR, executor)
-    assert found.rmse_rad < 0.5 * before
-    assert found.rmse_rad < 1.05 * right
-    again = rmse_rad(lambda d: kalman.estimate(d.signals, CAR, found.parameters), drives, executor)
-    assert again == found.rmse_rad
+    result = tune(kalman.estimate, wrong, names, drives, CAR, executor)
+    assert result.rmse_rad < 0.5 * before
+    assert result.rmse_rad < 1.05 * right
+    again = rmse_rad(lambda d: kalman.estimate(d.signals, CAR, result.parameters), drives, executor)
+    assert again == result.rmse_rad
 
 
 def test_the_checksum_depends_on_all_modules(tmp_path: Path) -> None:

@@ -120,9 +120,9 @@ def test_agrees_with_the_joint_gaussian_posterior() -> None:
             z = np.array([drive.gps_vx_mps[k], drive.gps_vy_mps[k]])
             equations.append(np.diag(1 / np.sqrt(np.diag(r))) @ H @ lever)
             values.append((z - H @ mean) / np.sqrt(np.diag(r)))
-    whole = np.concatenate(equations)
-    solution = np.linalg.lstsq(whole, np.concatenate(values), rcond=None)[0]
-    posterior = lever @ np.linalg.inv(whole.T @ whole) @ lever.T
+    system = np.concatenate(equations)
+    solution = np.linalg.lstsq(system, np.concatenate(values), rcond=None)[0]
+    posterior = lever @ np.linalg.inv(system.T @ system) @ lever.T
 
     state = last_state(drive, yaw_rate, NOISE)
     np.testing.assert_allclose(state.mean, mean + lever @ solution, rtol=0, atol=1e-9)
@@ -142,17 +142,17 @@ def last_state(drive: DriveSignals, yaw_rate: FloatArray, noise: FilterNoise) ->
 
 @kernel
 def covariances_over(
-    steps: int, every: int, turn: float, first: Any, q: Any, r: Any
+    steps: int, interval: int, turn: float, first: Any, q: Any, r: Any
 ) -> NDArray[np.float64]:
     state = independent_state((20.0, 0.0, 0.0, 0.0), first)
-    kept = np.empty((steps // every, 4, 4))
+    covariances = np.empty((steps // interval, 4, 4))
     for k in range(steps):
         predict(state, 0.0, 0.0, turn * np.sin(0.001 * k), STEP_S, q)
         if k % 10 == 0:
             update(state, 20.0, 0.0, r)
-        if k % every == every - 1:
-            kept[k // every] = state.covariance
-    return kept
+        if k % interval == interval - 1:
+            covariances[k // interval] = state.covariance
+    return covariances
 
 
 @pytest.mark.long
@@ -177,9 +177,9 @@ def test_josephs_form_retains_variances_that_rounding_would_lose() -> None:
 
 def test_biases_are_found() -> None:
     exact, _ = slalom(CAR, 30_000)
-    found = fuse(noisy(exact, seed=4), exact.yaw_rate_rad_s, FilterNoise())
-    assert found[1, -1] == pytest.approx(0.15, abs=0.01)
-    assert found[3, -1] == pytest.approx(0.15, abs=0.01)
+    estimate = fuse(noisy(exact, seed=4), exact.yaw_rate_rad_s, FilterNoise())
+    assert estimate[1, -1] == pytest.approx(0.15, abs=0.01)
+    assert estimate[3, -1] == pytest.approx(0.15, abs=0.01)
 
 
 def test_steady_circle_persists_without_a_fix() -> None:
@@ -188,17 +188,17 @@ def test_steady_circle_persists_without_a_fix() -> None:
     vx, vy, yaw_rate = 15 * constant, -0.4 * constant, 0.3 * constant
     drive = rolling_drive(CAR, vx, vy, yaw_rate, 0.05 * constant)
     only_first = without_fixes(drive, np.arange(3000) > 0)
-    found = fuse(only_first, yaw_rate, FilterNoise())
-    np.testing.assert_allclose(found[0], vx, atol=1e-9)
-    np.testing.assert_allclose(found[2], vy, atol=1e-9)
+    estimate = fuse(only_first, yaw_rate, FilterNoise())
+    np.testing.assert_allclose(estimate[0], vx, atol=1e-9)
+    np.testing.assert_allclose(estimate[2], vy, atol=1e-9)
 
 
 def test_begins_at_the_first_fix() -> None:
     drive = without_fixes(noisy(slalom(CAR, 500)[0], seed=7), np.arange(500) < 205)
-    found = fuse(drive, drive.yaw_rate_rad_s, FilterNoise())
-    assert np.isnan(found[0][:210]).all()
-    assert found[0][210] == drive.gps_vx_mps[210]
-    assert np.isfinite(found[:, 210:]).all()
+    estimate = fuse(drive, drive.yaw_rate_rad_s, FilterNoise())
+    assert np.isnan(estimate[0][:210]).all()
+    assert estimate[0][210] == drive.gps_vx_mps[210]
+    assert np.isfinite(estimate[:, 210:]).all()
     beta = kalman.estimate(drive, CAR, FilterNoise())
     assert np.array_equal(np.isnan(beta), np.arange(500) < 210)
 

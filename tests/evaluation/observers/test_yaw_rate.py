@@ -47,16 +47,16 @@ def test_agrees_with_the_textbook_filter_gaps_included() -> None:
         wheel_rl_rad_s=np.where(row // 500 == 4, np.nan, drive.wheel_rl_rad_s),
         ax_mps2=np.where(row // 400 == 1, -3.0, drive.ax_mps2),
     )
-    found = kalman.estimate_yaw_rate(drive, CAR, NOISE)
+    yaw_rate = kalman.estimate_yaw_rate(drive, CAR, NOISE)
     expected = textbook_filter(drive, NOISE)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(yaw_rate, expected, rtol=0, atol=1e-10)
 
 
 def test_bias_is_found_and_noise_reduced() -> None:
     exact, _ = slalom(CAR, 20_000)
-    found, bias = kalman.estimate_yaw_rate(noisy(exact, seed=2), CAR, NOISE)
+    yaw_rate, bias = kalman.estimate_yaw_rate(noisy(exact, seed=2), CAR, NOISE)
     assert bias[-1] == pytest.approx(0.01, abs=0.001)
-    error = (found - exact.yaw_rate_rad_s)[5000:]
+    error = (yaw_rate - exact.yaw_rate_rad_s)[5000:]
     assert abs(error.mean()) < 0.001
     assert error.std() < 0.005, "half of the gyroscope's noise"
 
@@ -65,18 +65,18 @@ def test_wheel_speeds_are_ignored_in_braking() -> None:
     exact, _ = slalom(CAR, 4000)
     braking = replace(exact, ax_mps2=np.full(4000, -3.0))
     slipping = replace(braking, wheel_rl_rad_s=0.97 * braking.wheel_rl_rad_s)
-    found, expected = (
+    yaw_rate, expected = (
         kalman.estimate_yaw_rate(drive, CAR, NOISE)[0] for drive in (slipping, braking)
     )
-    assert np.array_equal(found, expected)
+    assert np.array_equal(yaw_rate, expected)
 
 
 @pytest.mark.parametrize("name", ["d_class_sedan", "rear_drive_sedan"])
 def test_undriven_axle_gives_speed_and_yaw_rate_of_a_rolling_car(name: str) -> None:
     car = load_vehicle(name, SHIPPED_CONFIGS)
-    one = np.ones(1)
+    ones = np.ones(1)
     vx, vy, rate, steer = 12.0, -0.2, 0.35, 0.08
-    drive = rolling_drive(car, vx * one, vy * one, rate * one, steer * one)
+    drive = rolling_drive(car, vx * ones, vy * ones, rate * ones, steer * ones)
     axle = undriven_axle(drive, car)
     assert axle.yaw_rate_rad_s[0] == pytest.approx(rate, rel=1e-12)
     front = car.drivetrain.front_drive_share < 0.5

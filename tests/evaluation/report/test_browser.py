@@ -51,21 +51,21 @@ def browse(page: Path, folder: Path, *flags: str) -> subprocess.CompletedProcess
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
 
 
-def asked(page: Path, folder: Path, script: str, *flags: str) -> Any:
+def evaluate_script(page: Path, folder: Path, script: str, *flags: str) -> Any:
     """Return what a script that sets `answer` comes to on a page, without the page's policy."""
     text = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page.read_text("utf-8"))
-    told = (
+    command = (
         "const p = document.createElement('pre'); p.id = 'answer'; "
         "p.textContent = encodeURIComponent(JSON.stringify(answer)); document.body.append(p);"
     )
     asking = folder / "asking.html"
     asking.write_text(
-        text.replace("</body>", f"{script.replace('TELL', told)}</body>"), encoding="utf-8"
+        text.replace("</body>", f"{script.replace('TELL', command)}</body>"), encoding="utf-8"
     )
     shown = browse(asking, folder, "--virtual-time-budget=60000", "--dump-dom", *flags).stdout
-    found = re.search(r'<pre id="answer">(.*?)</pre>', shown, re.DOTALL)
-    assert found, shown[-2000:]
-    return json.loads(unquote(found[1]))
+    match = re.search(r'<pre id="answer">(.*?)</pre>', shown, re.DOTALL)
+    assert match, shown[-2000:]
+    return json.loads(unquote(match[1]))
 
 
 @pytest.mark.tools("axe.min.js")
@@ -81,9 +81,9 @@ def test_axe_has_no_complaint(
         "{broken: r.violations.map(v => [v.id, v.nodes.length, v.nodes[0].html]), "
         "passed: r.passes.length}; TELL });</script>"
     )
-    found = asked(pages[name], tmp_path, script, *flags)
-    assert found["broken"] == []
-    assert found["passed"] > 20
+    report = evaluate_script(pages[name], tmp_path, script, *flags)
+    assert report["broken"] == []
+    assert report["passed"] > 20
 
 
 @pytest.mark.parametrize("name", ["report", "watch"])
@@ -100,21 +100,21 @@ def test_a_narrow_screen_need_not_be_scrolled_across(
         "document.getElementById('f').contentDocument.documentElement; "
         "const answer = [d.scrollWidth, d.clientWidth]; TELL }</script>"
     )
-    wide, seen = asked(frame, tmp_path, script, "--allow-file-access-from-files")
+    wide, seen = evaluate_script(frame, tmp_path, script, "--allow-file-access-from-files")
     assert wide <= seen
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What came out of a browser: a picture of shape (height, width, 3), and its console."""
+    """The output of a browser: a picture of shape (height, width, 3), and its console."""
 
     picture: NDArray[np.uint8]
     console: list[str]
 
     def pixels(self, name: str, *, dark: bool = False) -> int:
         tone = PALETTE[name]
-        wanted = [int((tone.dark if dark else tone.light)[i : i + 2], 16) for i in (1, 3, 5)]
-        return int((self.picture == wanted).all(axis=2).sum())
+        colour = [int((tone.dark if dark else tone.light)[i : i + 2], 16) for i in (1, 3, 5)]
+        return int((self.picture == colour).all(axis=2).sum())
 
 
 def show(

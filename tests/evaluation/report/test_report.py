@@ -121,10 +121,10 @@ def test_table_two_has_the_evaluations_numbers(data: ReportData) -> None:
     assert [row[0] for row in rows] == ["1", "2", "3", "4", "5"]
     for row in rows:
         estimator = data.models[row[0]]
-        found = data.scenarios["nominal"]["results"][estimator]
-        assert row[2] == number(found["error_mean_deg"], 4, sign=True)
-        assert row[4] == number(found["error_std_deg"], 4)
-        assert is_good(row[4]) == (found["error_std_deg"] <= PAPER_TABLE_TWO[row[0]][1])
+        result = data.scenarios["nominal"]["results"][estimator]
+        assert row[2] == number(result["error_mean_deg"], 4, sign=True)
+        assert row[4] == number(result["error_std_deg"], 4)
+        assert is_good(row[4]) == (result["error_std_deg"] <= PAPER_TABLE_TWO[row[0]][1])
 
 
 def test_the_errors_of_blocks_add_up(data: ReportData) -> None:
@@ -170,16 +170,18 @@ def test_claims_name_scenarios_that_ship(data: ReportData, monkeypatch: pytest.M
 def test_every_claim_has_a_verdict(data: ReportData) -> None:
     verdicts = [evaluate_claim(claim, data) for claim in CLAIMS]
     assert len(verdicts) == len(CLAIMS) == 27
-    assert len({one.claim.statement for one in verdicts}) == len(CLAIMS)
-    for one in verdicts:
-        assert one.why
-        assert bool(one.figure) == (one.status is not Status.NOT_TESTABLE)
+    assert len({verdict.claim.statement for verdict in verdicts}) == len(CLAIMS)
+    for verdict in verdicts:
+        assert verdict.why
+        assert bool(verdict.figure) == (verdict.status is not Status.NOT_TESTABLE)
 
 
 def test_a_verdict_follows_from_the_figures(data: ReportData) -> None:
     assert evaluate_claim(noise_is_slight, data).status is Status.NOT_REPRODUCED
     content = deepcopy(dict(data.document.content))
-    (noisy,) = (one for one in content["scenarios"] if one["name"] == "noise_doubled")
+    (noisy,) = (
+        scenario for scenario in content["scenarios"] if scenario["name"] == "noise_doubled"
+    )
     noisy["results"][data.choice]["rmse_deg"] = 0.1
     verdict = evaluate_claim(noise_is_slight, changed(data, content))
     assert verdict.status is Status.REPRODUCED
@@ -188,7 +190,9 @@ def test_a_verdict_follows_from_the_figures(data: ReportData) -> None:
 
 def test_a_claim_without_its_drives_is_not_testable(data: ReportData) -> None:
     content = deepcopy(dict(data.document.content))
-    content["scenarios"] = [one for one in content["scenarios"] if one["name"] == "nominal"]
+    content["scenarios"] = [
+        scenario for scenario in content["scenarios"] if scenario["name"] == "nominal"
+    ]
     verdict = evaluate_claim(noise_is_slight, changed(data, content))
     assert verdict.status is Status.NOT_TESTABLE
     assert "noise_doubled" in verdict.why
@@ -196,11 +200,11 @@ def test_a_claim_without_its_drives_is_not_testable(data: ReportData) -> None:
 
 
 def test_an_evaluation_of_other_data_is_refused(reported: Reported, data: ReportData) -> None:
-    for path, told in (
+    for path, message in (
         (("estimators", data.choice, "intercept"), "cohort"),
         (("scenarios", 0, "results", data.choice, "rmse_deg"), "drive of"),
     ):
-        copy = reported.root.with_name(f"copy-{told.partition(' ')[0]}")
+        copy = reported.root.with_name(f"copy-{message.partition(' ')[0]}")
         shutil.copytree(reported.root, copy, dirs_exist_ok=True)
         content = deepcopy(dict(data.document.content))
         place: Any = content
@@ -208,7 +212,7 @@ def test_an_evaluation_of_other_data_is_refused(reported: Reported, data: Report
             place = place[key]
         place[path[-1]] += 0.001
         store_evaluation(evaluations_of(Warehouse(LocalFolder(copy))), content)
-        with pytest.raises(DataError, match=f"{told}.* has changed since evaluation 2"):
+        with pytest.raises(DataError, match=f"{message}.* has changed since evaluation 2"):
             call(copy, "report", "smoke")
 
 
@@ -227,19 +231,19 @@ def test_a_report_requires_an_evaluation(
 )
 def test_a_band_contains_every_sample(values: np.ndarray, bins: int) -> None:
     x = np.arange(len(values), dtype=np.float64)
-    found = band(x, values, bins)
-    assert len(found["x"]) <= bins
-    assert found["low"].min() == values.min()
-    assert found["high"].max() == values.max()
-    assert (found["low"] <= found["mean"] + 1e-9).all()
-    assert (found["mean"] <= found["high"] + 1e-9).all()
+    limits = band(x, values, bins)
+    assert len(limits["x"]) <= bins
+    assert limits["low"].min() == values.min()
+    assert limits["high"].max() == values.max()
+    assert (limits["low"] <= limits["mean"] + 1e-9).all()
+    assert (limits["mean"] <= limits["high"] + 1e-9).all()
 
 
 def test_a_band_has_a_gap_where_there_is_no_value() -> None:
     values = np.array([1.0, 2.0, np.nan, np.nan, 5.0])
-    found = band(np.arange(5.0), values, 3)
-    np.testing.assert_array_equal(found["mean"], [1.5, np.nan, 5.0])
-    np.testing.assert_array_equal(found["x"], [0.5, 2.5, 4.0])
+    limits = band(np.arange(5.0), values, 3)
+    np.testing.assert_array_equal(limits["mean"], [1.5, np.nan, 5.0])
+    np.testing.assert_array_equal(limits["x"], [0.5, 2.5, 4.0])
 
 
 NOTEBOOK = Path(__file__).parents[3] / "jobs/explore.py"
@@ -259,8 +263,8 @@ def executed(root: Path, folder: Path) -> tuple[int, str, str]:
 
 @pytest.mark.tools("marimo")
 def test_every_cell_works_on_a_root_with_a_model(smoke_root: Path, tmp_path: Path) -> None:
-    code, told, page = executed(smoke_root, tmp_path)
-    assert code == 0, told
+    code, output, page = executed(smoke_root, tmp_path)
+    assert code == 0, output
     assert "8 drives" in page
     assert re.search(r"Coefficients over .{0,20}1 version of smoke", page)
     assert "image/png" in page
@@ -270,8 +274,8 @@ def test_every_cell_works_on_a_root_with_a_model(smoke_root: Path, tmp_path: Pat
 def test_without_a_model_the_notebook_states_it(smoke_root: Path, tmp_path: Path) -> None:
     ignored = shutil.ignore_patterns("models", "runs")
     root = shutil.copytree(smoke_root, tmp_path / "data", ignore=ignored)
-    code, told, page = executed(root, tmp_path)
-    assert code == 0, told
+    code, output, page = executed(root, tmp_path)
+    assert code == 0, output
     assert "No model yet" in page
 
 

@@ -28,9 +28,9 @@ def frames(smoke_root: Path) -> DriveFrames:
 
 
 def data_of(page: str) -> Any:
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
-    assert found
-    return json.loads(found[1])
+    match = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+    assert match
+    return json.loads(match[1])
 
 
 def test_frames_are_those_of_the_log(frames: DriveFrames, smoke_root: Path) -> None:

@@ -70,8 +70,8 @@ def test_the_statement_hashes_names_as_python_does(warehouse: Warehouse) -> None
     update_grams(warehouse)
     cohort = load_cohort(warehouse)
     for name in ("drive", "vehicle"):
-        told = hash_names(cohort.drives[f"{name}_id"])
-        assert cohort.drives[f"{name}_hash"].to_pylist() == told.tolist()
+        hashes = hash_names(cohort.drives[f"{name}_id"])
+        assert cohort.drives[f"{name}_hash"].to_pylist() == hashes.tolist()
 
 
 COEFFICIENTS = (0.1, 0.4, 0.9, 0.2)
@@ -89,8 +89,10 @@ def test_a_fold_holds_out_whole_drives_cars_or_days(by: FoldKey, column: str) ->
     assert len(pairs) == len({value for value, _ in pairs})
     folds = cohort.folds(by, 4).complete_cases(INPUTS, LABEL)
     for number, gram in enumerate(folds.grams):
-        mine = [one for one, fold in zip(drives, assignment.fold, strict=True) if fold == number]
-        assert gram == Gram.from_counts((*INPUTS, LABEL), rows_of(mine))
+        members = [
+            drive for drive, fold in zip(drives, assignment.fold, strict=True) if fold == number
+        ]
+        assert gram == Gram.from_counts((*INPUTS, LABEL), rows_of(members))
     assert folds.total.n == 20 * 80
 
 
@@ -110,17 +112,17 @@ TRUE = np.array([0.5, -0.2, 0.1])
 
 def drives_of(seed: int, lost: dict[int, float], drives: int = 40, rows: int = 100) -> GramTable:
     """Drives of one law, but for lost ones, whose slopes are that many times it."""
-    random, found = np.random.default_rng(seed), list[Gram]()
+    random, grams = np.random.default_rng(seed), list[Gram]()
     for number in range(drives):
         x = random.normal(size=(rows, 3)) * np.exp(0.2 * random.normal(size=3))
         y = x @ TRUE * lost.get(number, 1.0) + 0.05 * random.normal(size=rows)
-        found.append(gram_of(np.rint(1000 * np.column_stack([x, y])).astype(np.int64)))
-    return table_of(found)
+        grams.append(gram_of(np.rint(1000 * np.column_stack([x, y])).astype(np.int64)))
+    return table_of(grams)
 
 
-def fitted(table: GramTable, found: DriveWeights) -> np.ndarray:
+def fitted(table: GramTable, weights: DriveWeights) -> np.ndarray:
     """Slopes of the exactly weighted sum."""
-    m = DriveMoments.from_table(weighted(table, found.weights))
+    m = DriveMoments.from_table(weighted(table, weights.weights))
     matrix = m.moments.sum(axis=0)
     slopes = np.linalg.solve(matrix[:-1, :-1], matrix[:-1, -1])[1:]
     return np.asarray(slopes * m.spread[-1] / m.spread[:-1])
@@ -135,20 +137,20 @@ def test_lost_drives_count_next_to_nothing() -> None:
     """As good as knowing which they are: slopes within the noise of the others."""
     for seed in range(10):
         table = drives_of(seed, {3: -1.0, 17: 4.0})
-        found = robust_weights(DriveMoments.from_table(table))
-        assert set(np.flatnonzero(found.weights < FULL).tolist()) == {3, 17}
-        assert found.weights[[3, 17]].max() <= 2
-        known = np.where(np.isin(np.arange(40), [3, 17]), 0, FULL)
-        told = fitted(table, DriveWeights(known, found.times))
-        assert fitted(table, found) == pytest.approx(told, abs=0.012)
-        everything = fitted(table, DriveWeights(np.full(40, FULL), found.times))
-        assert np.abs(everything - TRUE).max() > 3 * np.abs(fitted(table, found) - TRUE).max()
+        weights = robust_weights(DriveMoments.from_table(table))
+        assert set(np.flatnonzero(weights.weights < FULL).tolist()) == {3, 17}
+        assert weights.weights[[3, 17]].max() <= 2
+        expected_weights = np.where(np.isin(np.arange(40), [3, 17]), 0, FULL)
+        coefficients = fitted(table, DriveWeights(expected_weights, weights.times))
+        assert fitted(table, weights) == pytest.approx(coefficients, abs=0.012)
+        everything = fitted(table, DriveWeights(np.full(40, FULL), weights.times))
+        assert np.abs(everything - TRUE).max() > 3 * np.abs(fitted(table, weights) - TRUE).max()
 
 
 def test_no_more_than_a_tenth_of_the_weight_is_lost() -> None:
     table = drives_of(1, dict.fromkeys(range(8), 3.0))
-    found = robust_weights(DriveMoments.from_table(table))
-    lost = (table.n * (FULL - found.weights)).sum() / (FULL * table.n.sum())
+    weights = robust_weights(DriveMoments.from_table(table))
+    lost = (table.n * (FULL - weights.weights)).sum() / (FULL * table.n.sum())
     assert 0 < lost <= MAX_LOST_SHARE
 
 
@@ -163,9 +165,9 @@ def test_the_order_and_the_size_of_counts_do_not_matter() -> None:
     assert np.array_equal(origin.weights, parts)
 
 
-def test_whole_numbers_beyond_64_bits_stay_exact() -> None:
+def test_integers_beyond_64_bits_stay_exact() -> None:
     table = drives_of(5, {}, drives=2)
     large = GramTable(table.signals, table.n, table.sums, table.products * 2**34)
     expected = large.total()
-    found = weighted(large, np.array([FULL, FULL])).total()
-    assert found.products == tuple(FULL * one for one in expected.products)
+    gram = weighted(large, np.array([FULL, FULL])).total()
+    assert gram.products == tuple(FULL * product for product in expected.products)

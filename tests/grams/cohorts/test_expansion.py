@@ -41,18 +41,22 @@ def test_expanded_sums_are_those_of_the_rows(factor: int) -> None:
     rng = np.random.default_rng(1)
     grams, expected = [], []
     factors = rng.integers(-factor, factor + 1, (3, 3))
-    for own in factors:
+    for drive_factors in factors:
         counts = rng.integers(-(2**19), 2**19, (40, 3))
-        new = [own[0] * counts[:, 1], own[1] * np.ones(40, dtype=np.int64), own[2] * counts[:, 0]]
+        new = [
+            drive_factors[0] * counts[:, 1],
+            drive_factors[1] * np.ones(40, dtype=np.int64),
+            drive_factors[2] * counts[:, 0],
+        ]
         both = np.column_stack([counts, *new])
         grams.append(Gram.from_counts(("a", "b", "c"), counts))
         expected.append(Gram.from_counts(("a", "b", "c", "bx", "x", "ax"), both.astype(object)))
-    found = expand(table_of(grams), ("bx", "x", "ax"), [2, 0, 1], factors)
-    assert [found.row(i) for i in range(3)] == expected
-    assert found.total() == sum(expected[1:], expected[0])
-    assert found.totals(np.array([0, 1, 0]), 2) == [expected[0] + expected[2], expected[1]]
+    expanded = expand(table_of(grams), ("bx", "x", "ax"), [2, 0, 1], factors)
+    assert [expanded.row(i) for i in range(3)] == expected
+    assert expanded.total() == sum(expected[1:], expected[0])
+    assert expanded.totals(np.array([0, 1, 0]), 2) == [expected[0] + expected[2], expected[1]]
     # Products of the larger factors need more than 64 bits.
-    assert (found.products.dtype == object) == (factor > 7)
+    assert (expanded.products.dtype == object) == (factor > 7)
 
 
 def offset(signals: cars.Signals, yaw_rate: float, ay: float) -> None:
@@ -61,10 +65,10 @@ def offset(signals: cars.Signals, yaw_rate: float, ay: float) -> None:
 
 
 def drive(rng: np.random.Generator, car: int) -> dict[str, Any]:
-    made = cars.broken(
+    broken = cars.broken(
         cars.drive(rng, 1.5), lambda signals: offset(signals, 0.01 * (car - 1), 0.1 * (2 - car))
     )
-    return cars.counts({name: values[:1200] for name, values in made.items()})
+    return cars.counts({name: values[:1200] for name, values in broken.items()})
 
 
 @pytest.fixture(scope="module")
@@ -92,14 +96,16 @@ def counts_of_drive(warehouse: Warehouse, drive_id: str, numbers: dict[str, int]
         f"SELECT tick, {', '.join(plan.signals)} FROM log_counts WHERE drive_id = '{drive_id}' "
         "ORDER BY tick"
     )
-    found = {name: np.array(values) for name, values in rows.fetchnumpy().items()}
-    return DriveCounts(found.pop("tick"), found, numbers=numbers)
+    columns = {name: np.array(values) for name, values in rows.fetchnumpy().items()}
+    return DriveCounts(columns.pop("tick"), columns, numbers=numbers)
 
 
 def plan_of(names: tuple[str, ...]) -> ColumnPlan:
-    known = CATALOG
-    definitions = {name: one for name in names if (one := known.definition(name)) is not None}
-    return ColumnPlan.from_definitions(names, ColumnPlan.of_set(known, "fleet").rows, definitions)
+    catalog = CATALOG
+    definitions = {
+        name: definition for name in names if (definition := catalog.definition(name)) is not None
+    }
+    return ColumnPlan.from_definitions(names, ColumnPlan.of_set(catalog, "fleet").rows, definitions)
 
 
 def test_gram_rows_have_the_bits_of_the_rows(filled: Warehouse) -> None:
@@ -110,9 +116,11 @@ def test_gram_rows_have_the_bits_of_the_rows(filled: Warehouse) -> None:
     assert numbers_lacking == {"slip_lever", "slip_compliance"}  # no car has a receiver
     numbers = calibrate(filled).counts()
     for at, row in enumerate(cohort.drives.to_pylist()):
-        known = numbers[row["vehicle_id"]]
-        assert known["ay_offset"] != 0
-        columns = compute_columns(plan_of(WANTED), counts_of_drive(filled, row["drive_id"], known))
+        constants = numbers[row["vehicle_id"]]
+        assert constants["ay_offset"] != 0
+        columns = compute_columns(
+            plan_of(WANTED), counts_of_drive(filled, row["drive_id"], constants)
+        )
         assert not np.isnan(columns).any()
         by_rows = Gram.from_counts(WANTED, columns.T.astype(np.int64).astype(object))
         assert table.restrict(WANTED).row(at) == by_rows
@@ -121,8 +129,8 @@ def test_gram_rows_have_the_bits_of_the_rows(filled: Warehouse) -> None:
 def test_sums_over_folds_are_those_of_the_drives(filled: Warehouse) -> None:
     summed = load_cohort(filled, "true", "fleet", Folding(by="vehicle", count=10))
     total = load_cohort(filled, "true", "fleet").tables[0].total()
-    found = summed.folds("vehicle", 10).complete_cases(WANTED[:-1], WANTED[-1]).total
-    assert found == total.restrict(WANTED)
+    sums = summed.folds("vehicle", 10).complete_cases(WANTED[:-1], WANTED[-1]).total
+    assert sums == total.restrict(WANTED)
     assert "understeer_ay" not in summed.gram_condition(["understeer_ay"])
     assert "ay_mean_16" in summed.gram_condition(["understeer_ay"])
 
@@ -144,11 +152,13 @@ def test_a_model_is_published_scored_and_asked(filled: Warehouse) -> None:
     )
     version = fleet.models.publish("calibrated", chosen, force=True).version
     manifest = version.manifest
-    used = {one.number.name for one in manifest.definitions.values() if one.number}
+    used = {
+        definition.number.name for definition in manifest.definitions.values() if definition.number
+    }
     assert used
-    found = score(filled, manifest, "true")
-    assert found.rows == 8 * 1200
-    assert found.rmse_deg == pytest.approx(manifest.cross_validation.rmse_deg, rel=0.3)
+    result = score(filled, manifest, "true")
+    assert result.rows == 8 * 1200
+    assert result.rmse_deg == pytest.approx(manifest.cross_validation.rmse_deg, rel=0.3)
 
     frame = fleet.sql("SELECT * FROM log ORDER BY drive_id, tick").to_arrow_table()
     with pytest.raises(InputError, match="fleet-slip calibrate --car"):
@@ -159,4 +169,4 @@ def test_a_model_is_published_scored_and_asked(filled: Warehouse) -> None:
         frame = frame.append_column(name, [values])
     angle = predict(SIGNALS, manifest, frame).to_numpy()
     error = np.degrees(angle - frame["sideslip_rad"].to_numpy())
-    assert float(np.sqrt(np.mean(error**2))) == pytest.approx(found.rmse_deg, rel=1e-12)
+    assert float(np.sqrt(np.mean(error**2))) == pytest.approx(result.rmse_deg, rel=1e-12)

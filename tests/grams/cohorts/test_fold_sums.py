@@ -50,9 +50,9 @@ def test_sums_equal_those_of_the_cohort(
     plan = Folding(by=by, count=count)
     cohort = load_cohort(fleet, "adhesion > 0.65")
     summed = load_cohort(fleet, "adhesion > 0.65", folding=plan)
-    one, two = (each.folds(plan.by, plan.count) for each in (cohort, summed))
-    assert one.names == two.names
-    assert one.tables == two.tables
+    of_drives, of_sums = (source.folds(plan.by, plan.count) for source in (cohort, summed))
+    assert of_drives.names == of_sums.names
+    assert of_drives.tables == of_sums.tables
     assert (summed.rows, summed.drive_count) == (cohort.rows, cohort.drive_count)
     assert summed.inputs == cohort.inputs
     assert summed.gram_condition(["ax"]) == cohort.gram_condition(["ax"])
@@ -77,16 +77,16 @@ def test_models_are_compared_on_the_same_drives_or_not_at_all(
     update_grams(warehouse)
     plan = Folding(count=3)
     shared = MODELS.model_copy(update={"folds": plan})
-    whole = select(load_cohort(warehouse), shared)
+    selection = select(load_cohort(warehouse), shared)
     summed = select(load_cohort(warehouse, folding=plan), shared)
-    assert summed.as_dict() == whole.as_dict()
+    assert summed.as_dict() == selection.as_dict()
     assert {model.name for model in summed.models} == compared
     assert {model.drives for model in summed.models} == drives
     assert len({model.pooled.rows for model in summed.models}) == 1
     for name in {model.name for model in MODELS.model} - compared:
         assert "not comparable: 6 of 36 drives lack wheel_" in summed.skipped[name]
-    own = load_cohort(warehouse).complete_cases(summed.winner.model.signals)
-    assert summed.winner.model.drives == len(own.drives)
+    complete = load_cohort(warehouse).complete_cases(summed.winner.model.signals)
+    assert summed.winner.model.drives == len(complete.drives)
 
 
 def test_days_add_up_to_those_of_the_drives(
@@ -113,7 +113,10 @@ def test_days_add_up_to_those_of_the_drives(
         assert sums.days == tuple(sorted(set(days)))
         assert sums.drives == tuple(days.count(day) for day in sums.days)
         for day, gram in zip(sums.days, sums.grams, strict=True):
-            assert gram == served.table.take(np.array([one == day for one in days])).total()
+            assert (
+                gram
+                == served.table.take(np.array([drive_day == day for drive_day in days])).total()
+            )
     with pytest.raises(DataError, match="no drive matches"):
         sum_days(warehouse, ["ax"], "mass_kg > 1e9")
     with pytest.raises(DataError, match="no drive of the cohort has all of"):
@@ -125,11 +128,11 @@ def test_days_add_up_to_those_of_the_drives(
     ["mass_kg > 1e9", "no_such_column = 1", "mass_kg >", "drive_id = 'drive-000000001'"],
 )
 def test_errors_are_those_of_the_cohort(fleet: Warehouse, predicate: str) -> None:
-    with pytest.raises(FleetSlipError) as whole:
+    with pytest.raises(FleetSlipError) as caught:
         load_cohort(fleet, predicate).folds("drive", 5)
-    with pytest.raises(type(whole.value)) as summed:
+    with pytest.raises(type(caught.value)) as summed:
         load_cohort(fleet, predicate, folding=Folding())
-    assert str(summed.value) == str(whole.value)
+    assert str(summed.value) == str(caught.value)
 
 
 def test_sums_over_other_folds_are_read_again(fleet: Warehouse) -> None:
@@ -192,7 +195,7 @@ def test_a_reader_opens_anew_only_what_changed(tmp_path: Path) -> None:
         assert after.rows > before.rows
 
 
-def test_where_there_are_logs_the_next_command_is_gram_alone(warehouse: Warehouse) -> None:
+def test_the_next_command_with_logs_is_gram_alone(warehouse: Warehouse) -> None:
     land(warehouse, "a", log_rows("a", random_counts(np.random.default_rng(1), 50)))
     with pytest.raises(DataError, match=r"no Gram rows yet\. Run: fleet-slip gram\.$"):
         load_cohort(warehouse, folding=Folding())

@@ -28,28 +28,28 @@ Drive = tuple[str, str, str | None, int | None, int]
 @st.composite
 def drives(draw: st.DrawFn) -> list[Drive]:
     """Draw drives of two cars; some are dated, some pieces of one file."""
-    found: list[Drive] = []
+    drawn: list[Drive] = []
     for number in range(draw(st.integers(1, 9))):
         car = draw(st.sampled_from("ab"))
         dated = draw(st.booleans())
         start_s = draw(st.integers(0, 6000)) if dated else None
-        earlier = [one for one in found if one[1] == car and (one[3] is not None) == dated]
-        named = [None if dated else f"d{number}", *(one[2] or one[0] for one in earlier)]
-        found.append((f"d{number}", car, draw(st.sampled_from(named)), start_s, 100))
-    return found
+        earlier = [drive for drive in drawn if drive[1] == car and (drive[3] is not None) == dated]
+        named = [None if dated else f"d{number}", *(drive[2] or drive[0] for drive in earlier)]
+        drawn.append((f"d{number}", car, draw(st.sampled_from(named)), start_s, 100))
+    return drawn
 
 
-def trips_of(found: list[Drive]) -> dict[str, str]:
+def trips_of(drives: list[Drive]) -> dict[str, str]:
     """Return the trip of each drive, by SQL."""
-    at = [None if one[3] is None else BEGAN + timedelta(seconds=one[3]) for one in found]
+    at = [None if drive[3] is None else BEGAN + timedelta(seconds=drive[3]) for drive in drives]
     grams = pa.table(
         {
-            "feature_set": ["x"] * len(found),
-            "drive_id": [one[0] for one in found],
-            "vehicle_id": [one[1] for one in found],
-            "trip_id": pa.array([one[2] for one in found], pa.string()),
+            "feature_set": ["x"] * len(drives),
+            "drive_id": [drive[0] for drive in drives],
+            "vehicle_id": [drive[1] for drive in drives],
+            "trip_id": pa.array([drive[2] for drive in drives], pa.string()),
             "started_at": pa.array(at, pa.timestamp("us", tz="UTC")),
-            "duration_s": [float(one[4]) for one in found],
+            "duration_s": [float(drive[4]) for drive in drives],
         }
     )
     statement = read_sql("jobs", "trips.sql").format(
@@ -60,28 +60,31 @@ def trips_of(found: list[Drive]) -> dict[str, str]:
         return dict(database.sql(statement).fetchall())
 
 
-def joined(found: list[Drive]) -> set[frozenset[str]]:
+def joined(drives: list[Drive]) -> set[frozenset[str]]:
     """Return the trips by joining any two drives that belong together, until none is left."""
-    groups = [{one[0]} for one in found]
-    for i, a in enumerate(found):
-        for b in found[:i]:
+    groups = [{drive[0]} for drive in drives]
+    for i, a in enumerate(drives):
+        for b in drives[:i]:
             same_file = (a[2] or a[0]) == (b[2] or b[0])
-            near = None not in (a[3], b[3]) and abs(a[3] - b[3]) <= LONGEST_PAUSE_S + 100  # type: ignore[operator]
-            if a[1] == b[1] and (same_file or near):
-                one = next(group for group in groups if a[0] in group)
+            is_near = None not in (a[3], b[3]) and abs(a[3] - b[3]) <= LONGEST_PAUSE_S + 100  # type: ignore[operator]
+            if a[1] == b[1] and (same_file or is_near):
+                first = next(group for group in groups if a[0] in group)
                 other = next(group for group in groups if b[0] in group)
-                if one is not other:
-                    one |= other
+                if first is not other:
+                    first |= other
                     groups.remove(other)
     return {frozenset(group) for group in groups}
 
 
 @given(drives())
-def test_drives_that_follow_each_other_are_one_trip(found: list[Drive]) -> None:
-    trips = trips_of(found)
-    every = {one[0]: trips.get(one[0], one[0]) for one in found}
-    groups = {frozenset(d for d in every if every[d] == trip) for trip in every.values()}
-    assert groups == joined(found)
+def test_drives_that_follow_each_other_are_one_trip(drawn: list[Drive]) -> None:
+    trips = trips_of(drawn)
+    trip_of_drive = {drive[0]: trips.get(drive[0], drive[0]) for drive in drawn}
+    groups = {
+        frozenset(d for d in trip_of_drive if trip_of_drive[d] == trip)
+        for trip in trip_of_drive.values()
+    }
+    assert groups == joined(drawn)
 
 
 def test_a_pause_of_ten_minutes_does_not_part_a_trip_and_a_longer_one_does() -> None:
@@ -102,7 +105,7 @@ def log_of(rng: np.random.Generator, start: datetime, rows: int = 400) -> dict[s
     beta = 0.8 * ay - 0.3 * ax + rng.normal(0, 0.2, rows)
     times = [start + timedelta(milliseconds=10 * i) for i in range(rows)]
     return {
-        "t": [one.strftime("%Y-%m-%d %H:%M:%S.%f") for one in times],
+        "t": [time.strftime("%Y-%m-%d %H:%M:%S.%f") for time in times],
         "ax": [f"{x:.3f}" for x in ax],
         "ay": [f"{x:.3f}" for x in ay],
         "beta": [f"{x:.3f}" for x in beta],
@@ -128,23 +131,23 @@ def roots(tmp_path_factory: pytest.TempPathFactory) -> tuple[Fleet, Fleet]:
             rows = slice(first, first + 100)
             files[1].append(write(folder, f"piece-{drive}-{first}.csv", log, rows))
     fleets = []
-    for name, some in zip(("whole", "cut"), files, strict=True):
+    for name, parts in zip(("whole", "cut"), files, strict=True):
         fleet = fleet_slip.open(folder / name)
-        fleet.ingest(some, mapping(format="%Y-%m-%d %H:%M:%S%.f"))
+        fleet.ingest(parts, mapping(format="%Y-%m-%d %H:%M:%S%.f"))
         fleet.gram()
         fleets.append(fleet)
     return fleets[0], fleets[1]
 
 
 def test_a_log_that_was_cut_gives_the_folds_of_the_whole(roots: tuple[Fleet, Fleet]) -> None:
-    whole, cut = (load_cohort(fleet.warehouse) for fleet in roots)
-    assert (whole.drive_count, cut.drive_count) == (5, 20)
+    uncut, cut = (load_cohort(fleet.warehouse) for fleet in roots)
+    assert (uncut.drive_count, cut.drive_count) == (5, 20)
     folds = [
         cohort.folds("drive", EACH).complete_cases(["ax", "ay"], "sideslip")
-        for cohort in (whole, cut)
+        for cohort in (uncut, cut)
     ]
     assert len(folds[1].names) == 5
-    sums = [sorted((gram.n, gram.products) for gram in one.grams) for one in folds]
+    sums = [sorted((gram.n, gram.products) for gram in training.grams) for training in folds]
     assert sums[0] == sums[1]
 
 
@@ -164,7 +167,7 @@ def test_pieces_of_one_undated_file_are_one_trip(tmp_path: Path) -> None:
     assert {row[2:] for row in rows} == {("log", "log.csv", None, 100)}
     fleet.gram()
     trips = load_cohort(fleet.warehouse).drives.select(["drive_id", "trip"]).to_pylist()
-    assert {one["drive_id"]: one["trip"] for one in trips} == {
+    assert {piece["drive_id"]: piece["trip"] for piece in trips} == {
         first: first,
         second: first,
         third: third,

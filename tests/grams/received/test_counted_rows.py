@@ -66,8 +66,8 @@ def test_rows_land_as_they_are_and_are_fitted(fleet: Fleet, send: Send) -> None:
             gram.products,
         )
         assert (row["source"], row["day"]) == ("received", date(2024, 5, 1))
-    found = fleet.cohort().select(model="ax,ay")
-    assert (found.cohort.rows, found.cohort.count_onboard_with()) == (3000, 6)
+    selection = fleet.cohort().select(model="ax,ay")
+    assert (selection.cohort.rows, selection.cohort.count_onboard_with()) == (3000, 6)
     assert "sent Gram rows of logged signals" in fleet.cohort().select().remark
     assert not fleet.maintenance.verify(full=True).findings
 
@@ -96,7 +96,9 @@ HERE = np.array(GRAM.products)
 K = len(GRAM.signals)
 NEGATIVE = HERE.copy()
 NEGATIVE[1] = int((HERE[0] * HERE[2]) ** 0.5) + 10**6
-TOO_LONG = (np.array(some) * (MAX_ROWS_OF_A_DAY // 500 + 1) for some in (GRAM.sums, GRAM.products))
+TOO_LONG = (
+    np.array(integers) * (MAX_ROWS_OF_A_DAY // 500 + 1) for integers in (GRAM.sums, GRAM.products)
+)
 LONG_SUMS, LONG_PRODUCTS = TOO_LONG
 
 
@@ -282,7 +284,7 @@ def test_pages_need_checksums_and_a_flipped_bit_is_found(fleet: Fleet, tmp_path:
     assert gram_rows(fleet) == []
 
 
-def test_what_is_no_table_is_not_taken(fleet: Fleet, send: Send, tmp_path: Path) -> None:
+def test_a_file_that_is_no_table_is_refused(fleet: Fleet, send: Send, tmp_path: Path) -> None:
     table = rows_of_fleet(3, START_S, seed=1).drop_columns(["part", "course_late"])
     assert send(table).gram_rows == 3
     (tmp_path / "text").write_text("FSGR")
@@ -315,8 +317,8 @@ def test_rows_of_a_drive_go_when_its_log_comes(
     shutil.copytree(smoke_root / "logs", tmp_path / "data" / "logs")
     report = fleet.gram()
     assert report.received_dropped == 2
-    left = {row["drive_id"] for row in gram_rows(fleet) if row["source"] == "received"}
-    assert len(left) == 1 and left.pop().startswith("VIN2")
+    remaining = {row["drive_id"] for row in gram_rows(fleet) if row["source"] == "received"}
+    assert len(remaining) == 1 and remaining.pop().startswith("VIN2")
     assert not fleet.gram().changed
 
 
@@ -332,7 +334,7 @@ def counts(draw: st.DrawFn) -> Any:
 
 @settings(max_examples=200)
 @given(counts())
-def test_what_counts_have_is_possible(rows: Any) -> None:
+def test_sums_of_real_counts_are_accepted(rows: Any) -> None:
     assert find_impossible(table_of([Gram.from_counts("abc", rows)]), RANGES) == {}
 
 
@@ -361,7 +363,7 @@ DRIVE = Gram.from_counts("abc", np.array([[3, 5, -7], [4, 5, 900], [-2, 8, 11], 
         ("products", 3, -50_000, INDEFINITE),
     ],
 )
-def test_what_no_counts_have_is_told(field: str, place: int, change: int, reason: str) -> None:
+def test_impossible_sums_are_reported(field: str, place: int, change: int, reason: str) -> None:
     table = table_of([DRIVE])
     getattr(table, field).reshape(-1)[place] += np.int64(change)
     assert find_impossible(table, RANGES) == {0: reason}

@@ -99,7 +99,7 @@ def test_texts_that_repeat_prefixes_are_not_decoded(
     assert pa.default_memory_pool().max_memory() < max(before) + 10 * MEBIBYTE
 
 
-def test_what_other_programs_write_is_read(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+def test_tables_of_other_programs_are_read(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
     row = row_of(gram_of(1))
     wide = {"vehicle_id": pa.large_string(), "sums": pa.large_list(pa.int64()), "part": pa.null()}
     columns = [
@@ -125,15 +125,17 @@ def test_headers_state_what_pages_hold(version: str) -> None:
         data_page_size=1000,
         write_batch_size=100,
     )
-    found, pages = on_board.read_pages(stream.getvalue())
-    assert found == rows
+    page_headers, pages = on_board.read_pages(stream.getvalue())
+    assert page_headers == rows
     by_column: dict[str, list[on_board.Page]] = {"a": [], "b": [], "c": []}
     for page in pages:
         assert page.has_checksum
         by_column[page.column].append(page)
-    values = {name: sum(page.values for page in found) for name, found in by_column.items()}
+    values = {
+        name: sum(page.values for page in page_headers) for name, page_headers in by_column.items()
+    }
     assert values == {"a": rows, "b": 2 * rows + 2, "c": rows}  # b has a dictionary of two texts
-    assert all(len(found) > 1 for found in by_column.values())
+    assert all(len(page_headers) > 1 for page_headers in by_column.values())
 
 
 def test_many_pages_and_pages_behind_the_end_of_a_column_are_refused(

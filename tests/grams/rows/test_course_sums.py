@@ -28,23 +28,23 @@ APART = 400
 def plain_changes(table: pa.Table, late: int = 0, apart: int = APART) -> dict[int, tuple[int, ...]]:
     """Tick of each change, and its last four columns, in words of plain Python."""
     rows = {row["tick"]: row for row in table.to_pylist()}
-    units, found = course_units(SIGNALS), dict[int, tuple[int, ...]]()
-    whole = math.floor(Fraction(late, 4) + Fraction(1, 2))
+    units, changes = course_units(SIGNALS), dict[int, tuple[int, ...]]()
+    ticks = math.floor(Fraction(late, 4) + Fraction(1, 2))
     for tick in rows:
-        now, before = (rows.get(t + whole, {}).get("course") for t in (tick, tick - apart))
+        now, before = (rows.get(t + ticks, {}).get("course") for t in (tick, tick - apart))
         between = [rows.get(t, {}).get("yaw_rate") for t in range(tick - apart, tick + 1)]
         if None in (now, before, *between):
             continue
         turned = between[0] + between[-1] + 2 * sum(between[1:-1])
-        rest = Fraction(late, 4) - whole  # of a tick, which is two counts of what is turned
+        remainder = Fraction(late, 4) - ticks  # of a tick, which is two counts of what is turned
         angle = Fraction(now - before, 65536) * units.turn - turned
-        angle += 2 * rest * (between[-1] - between[0])
+        angle += 2 * remainder * (between[-1] - between[0])
         angle -= units.turn * nearest(angle / units.turn)
         if abs(angle) * Fraction(1, 2_000_000) <= MAX_CHANGE_RAD:
             change = nearest(angle / 200)
             slow = max(abs(between[0]), abs(between[-1])) <= 200 and abs(turned) <= 100_000
-            found[tick] = (nearest(Fraction(turned, 256)), slow, slow * change, change)
-    return found
+            changes[tick] = (nearest(Fraction(turned, 256)), slow, slow * change, change)
+    return changes
 
 
 @pytest.mark.parametrize(
@@ -76,17 +76,17 @@ def test_gram_rows_of_several_times_are_sums_of_the_plain_changes(
     files = warehouse.logs.snapshot().files
     rows = aggregate(warehouse, files, feature_set="three", delays={"car-1": late})
     assert set(rows["course_late"].to_pylist()) == {late}
-    found = defaultdict[tuple[str, str], Any](int)
+    sums = defaultdict[tuple[str, str], Any](int)
     for row in rows.filter(pc.match_substring(rows["signals"], TURNED)).to_pylist():
         gram = Gram(tuple(row["signals"].split(",")), row["n"], row["sums"], row["products"])
         last = gram.restrict([TURNED, "straight", "straight_course", LABEL])
-        found[row["drive_id"], row["part"]] += np.array([*last.sums, *last.products])
+        sums[row["drive_id"], row["part"]] += np.array([*last.sums, *last.products])
     for name, table in drives.items():
         for time_s in times:
             changes = np.array([*plain_changes(table, late, int(100 * time_s)).values()])
             products = (changes.T @ changes)[np.tril_indices(4)]
             expected = [*changes.sum(axis=0).tolist(), *products.tolist()]
-            assert found[name, f"{time_s:f} s"].tolist() == expected
+            assert sums[name, f"{time_s:f} s"].tolist() == expected
 
 
 def test_a_log_without_a_course_has_no_changes(warehouse: Warehouse) -> None:

@@ -54,9 +54,9 @@ def test_gram_rows_equal_sums_of_python_integers_at_the_ends_of_int16(warehouse:
 
 def test_rows_that_lack_signals_have_gram_rows_of_their_own(warehouse: Warehouse) -> None:
     counts = random_counts(np.random.default_rng(1), 100)
-    whole = {name: counts[name].tolist() for name in NAMES}
-    holes = dict(whole, ay=[None if i % 3 == 0 else v for i, v in enumerate(whole["ay"])])
-    absent = {name: values for name, values in whole.items() if not name.startswith("wheel")}
+    complete = {name: counts[name].tolist() for name in NAMES}
+    holes = dict(complete, ay=[None if i % 3 == 0 else v for i, v in enumerate(complete["ay"])])
+    absent = {name: values for name, values in complete.items() if not name.startswith("wheel")}
     land(warehouse, "one", log_rows("holes", holes), log_rows("absent", absent))
     update_grams(warehouse)
     grams = stored(warehouse)
@@ -64,10 +64,13 @@ def test_rows_that_lack_signals_have_gram_rows_of_their_own(warehouse: Warehouse
         ("holes", 34), ("holes", 66), ("absent", 100),
     }  # fmt: skip
     without_ay = tuple(sorted({*NAMES} - {"ay"}))
-    with_hole = [whole[name][::3] for name in without_ay]
+    with_hole = [complete[name][::3] for name in without_ay]
     assert list(grams["holes", without_ay].products) == integer_gram(with_hole)[1]
-    few = tuple(sorted(name for name in NAMES if not name.startswith("wheel")))
-    assert list(grams["absent", few].products) == integer_gram([whole[name] for name in few])[1]
+    present = tuple(sorted(name for name in NAMES if not name.startswith("wheel")))
+    assert (
+        list(grams["absent", present].products)
+        == integer_gram([complete[name] for name in present])[1]
+    )
     assert check_grams(warehouse, 1).drives == 2
 
 
@@ -101,9 +104,11 @@ def test_gram_rows_of_a_file_that_is_gone_are_dropped(warehouse: Warehouse) -> N
         land(warehouse, name, log_rows(name, random_counts(rng, 20)))
     update_grams(warehouse)
     logs = warehouse.logs.snapshot()
-    gone = next(file for file in logs.files if "/b-" in file.path)
-    logs.commit(Change(remove=[gone], transactions=[AppTransaction("test/remove", 1)]))
-    assert find_backlog(warehouse.logs.snapshot(), warehouse.grams.snapshot()).stale == {gone.path}
+    removed = next(file for file in logs.files if "/b-" in file.path)
+    logs.commit(Change(remove=[removed], transactions=[AppTransaction("test/remove", 1)]))
+    assert find_backlog(warehouse.logs.snapshot(), warehouse.grams.snapshot()).stale == {
+        removed.path
+    }
     assert update_grams(warehouse).files_dropped == 1
     assert {drive for drive, _ in stored(warehouse)} == {"a", "c"}
     assert not update_grams(warehouse).changed
@@ -124,8 +129,8 @@ def test_merging_and_rewriting_take_few_rows_at_a_time(
         assert sum(rows for path, rows in before.items() if path not in files) <= 10
         assert max(files.values()) < 10
     assert sum(rows < 5 for rows in files.values()) <= 5
-    first, *others = warehouse.logs.snapshot().files
-    warehouse.logs.snapshot().commit(Change(remove=[first, *others[:5]]))
+    first, *remaining = warehouse.logs.snapshot().files
+    warehouse.logs.snapshot().commit(Change(remove=[first, *remaining[:5]]))
     update_grams(warehouse)
     assert {drive for drive, _ in stored(warehouse)} == {
         f"d{number}-{i}" for number in range(6, 9) for i in range(3)
@@ -169,7 +174,7 @@ def test_a_drive_that_one_side_lacks_differs() -> None:
 
 def test_gram_rows_that_came_in_pieces_are_one_table() -> None:
     counts = np.random.default_rng(4).integers(-9, 9, (6, 10, 2))
-    grams = [Gram.from_counts(("ax", "ay"), one) for one in counts]
+    grams = [Gram.from_counts(("ax", "ay"), item) for item in counts]
     rows = pa.table(
         {
             "n": [gram.n for gram in grams],
@@ -179,8 +184,8 @@ def test_gram_rows_that_came_in_pieces_are_one_table() -> None:
     )
     pieces = pa.concat_tables([rows.slice(0, 1), rows.slice(1, 3), rows.slice(4)])
     assert pieces["sums"].num_chunks == 3
-    for one in (rows, pieces):
-        table = gram_table("ax,ay", one)
+    for item in (rows, pieces):
+        table = gram_table("ax,ay", item)
         assert table.signals == ("ax", "ay")
         assert table.products.shape == (6, packed_size(2))
         assert [table.sums[i].tolist() for i in range(6)] == [list(g.sums) for g in grams]

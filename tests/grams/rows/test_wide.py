@@ -34,9 +34,9 @@ from tests.support.counts import nearest
 from tests.support.logs import land, log_rows, random_counts
 
 OPEN_ABOVE = Gate(by=SPEED, low=500, peak=1501)
-DEFINITIONS = {name: one for name, one in OF_MODELS.items() if one.number is None} | {
-    "above": Definition(of="ay", over="mean", ticks=3, ratio=Fraction(16), gate=OPEN_ABOVE)
-}
+DEFINITIONS = {
+    name: definition for name, definition in OF_MODELS.items() if definition.number is None
+} | {"above": Definition(of="ay", over="mean", ticks=3, ratio=Fraction(16), gate=OPEN_ABOVE)}
 
 COUNT = st.one_of(
     st.none(), st.sampled_from([-32768, -32767, -1, 0, 1, 32767]), st.integers(-2000, 2000)
@@ -62,38 +62,42 @@ def clip(value: int, bits: int) -> int:
     return max(-limit_of(bits), min(limit_of(bits), value))
 
 
-def by_integers(rows: list[dict[str, Any]], one: Definition) -> list[int | None]:
+def by_integers(rows: list[dict[str, Any]], definition: Definition) -> list[int | None]:
     """The rule of the windows, in words of plain Python."""
-    found: list[int | None] = []
+    values: list[int | None] = []
     for row in rows:
-        now = looked_at(row, one)
-        if one.over == "lag":
-            past = [looked_at(r, one) for r in rows if r["tick"] == row["tick"] - one.ticks]
+        now = looked_at(row, definition)
+        if definition.over == "lag":
+            past = [
+                looked_at(r, definition)
+                for r in rows
+                if r["tick"] == row["tick"] - definition.ticks
+            ]
             value = Fraction(past[0]) if past and past[0] is not None else None
         elif now is None:
             value = None
-        elif one.over is None:
+        elif definition.over is None:
             value = Fraction(now)
         else:
-            first = row["tick"] - one.ticks + 1 if one.ticks else 0
-            there = [looked_at(r, one) for r in rows if first <= r["tick"] <= row["tick"]]
-            present = [v for v in there if v is not None]
-            value = Fraction(sum(present), 1 if one.over == "sum" else len(present))
-        count = None if value is None else clip(nearest(value * one.ratio), one.bits)
-        if one.fact and count is not None:
-            number = fact(row, one)
-            times = None if number is None else nearest(count * number * one.fact.ratio)
-            count = None if times is None else clip(times, one.bits)
-        found.append(count)
-    if one.gate:
-        openings = by_integers(rows, one.gate.by)
+            first = row["tick"] - definition.ticks + 1 if definition.ticks else 0
+            window = [looked_at(r, definition) for r in rows if first <= r["tick"] <= row["tick"]]
+            present = [v for v in window if v is not None]
+            value = Fraction(sum(present), 1 if definition.over == "sum" else len(present))
+        count = None if value is None else clip(nearest(value * definition.ratio), definition.bits)
+        if definition.fact and count is not None:
+            number = fact(row, definition)
+            times = None if number is None else nearest(count * number * definition.fact.ratio)
+            count = None if times is None else clip(times, definition.bits)
+        values.append(count)
+    if definition.gate:
+        openings = by_integers(rows, definition.gate.by)
         return [
             None
             if value is None or at is None
-            else nearest(Fraction(value * weight(at, one.gate), WEIGHT))
-            for value, at in zip(found, openings, strict=True)
+            else nearest(Fraction(value * weight(at, definition.gate), WEIGHT))
+            for value, at in zip(values, openings, strict=True)
         ]
-    return found
+    return values
 
 
 def weight(at: int, gate: Gate) -> int:
@@ -106,19 +110,19 @@ def weight(at: int, gate: Gate) -> int:
     return WEIGHT - floor(Fraction(WEIGHT * (at - gate.peak), gate.high - gate.peak))
 
 
-def fact(row: dict[str, Any], one: Definition) -> int | None:
-    assert one.fact is not None
-    if one.fact.equals:
-        return int(row["vehicle_model"] == one.fact.equals)
+def fact(row: dict[str, Any], definition: Definition) -> int | None:
+    assert definition.fact is not None
+    if definition.fact.equals:
+        return int(row["vehicle_model"] == definition.fact.equals)
     mass = row["mass_kg"]
     if mass is None or not abs(mass) <= 65536:
         return None
-    return nearest(Fraction(mass)) - one.fact.less
+    return nearest(Fraction(mass)) - definition.fact.less
 
 
-def looked_at(row: dict[str, Any], one: Definition) -> int | None:
-    if not one.sql:
-        count: int | None = row[one.of]
+def looked_at(row: dict[str, Any], definition: Definition) -> int | None:
+    if not definition.sql:
+        count: int | None = row[definition.of]
         return count
     values = [row[name] for name in SIGNALS[1:]]
     if None in values:
@@ -127,7 +131,7 @@ def looked_at(row: dict[str, Any], one: Definition) -> int | None:
     if 31 * sum(wheels) < 120_000:
         return None
     quotient = Fraction(4_000_000 * ay - 310 * yaw_rate * sum(wheels), 31 * sum(wheels))
-    return clip(nearest(quotient), one.of_bits)
+    return clip(nearest(quotient), definition.of_bits)
 
 
 def counts_of_table(table: pa.Table) -> DriveCounts:
@@ -142,16 +146,16 @@ def counts_of_table(table: pa.Table) -> DriveCounts:
 def test_kernel_sql_and_plain_integers_agree_on_hostile_drives(table: pa.Table) -> None:
     plan = ColumnPlan.from_definitions(list(DEFINITIONS), {}, DEFINITIONS)
     blocks = plan.blocks(counts_of_table(table))
-    found = [(block.copy(), clips.copy()) for _, block, clips in blocks]
-    kernel, clipped = (np.concatenate(parts, axis=-1) for parts in zip(*found, strict=True))
+    computed = [(block.copy(), clips.copy()) for _, block, clips in blocks]
+    kernel, clipped = (np.concatenate(parts, axis=-1) for parts in zip(*computed, strict=True))
     with duckdb.connect() as database:
         database.register("log_counts", table.drop_columns(["day"]))
         rows = with_columns("log_counts", {}, DEFINITIONS)
         query = f"SELECT {', '.join(DEFINITIONS)}, clipped FROM {rows} ORDER BY tick"
         sql: pa.Table = database.sql(query).to_arrow_table()
     logged = table.to_pylist()
-    for number, (name, one) in enumerate(DEFINITIONS.items()):
-        expected = by_integers(logged, one)
+    for number, (name, definition) in enumerate(DEFINITIONS.items()):
+        expected = by_integers(logged, definition)
         assert sql[name].to_pylist() == expected, name
         assert [None if np.isnan(v) else int(v) for v in kernel[number]] == expected, name
     assert sql["clipped"].to_pylist() == clipped.astype(int).tolist()
@@ -196,8 +200,8 @@ def test_gram_rows_of_the_kernel_are_those_of_the_statement(
 ) -> None:
     feature_set = "few"
     warehouse = Warehouse(warehouse.root, configs_with(tmp_path / "configs", features=FEW))
-    whole = log_rows("whole", random_counts(np.random.default_rng(3), 700))
-    land(warehouse, "one", hostile_drive("b", 400, 1), hostile_drive("a", 2, 2).slice(0, 1), whole)
+    rows = log_rows("whole", random_counts(np.random.default_rng(3), 700))
+    land(warehouse, "one", hostile_drive("b", 400, 1), hostile_drive("a", 2, 2).slice(0, 1), rows)
     land(warehouse, "two", hostile_drive("c", 5000, 4, null=0.001))
     files = warehouse.logs.snapshot().files
     kernel = wide_grams(warehouse, files, feature_set)
@@ -216,20 +220,20 @@ def test_blocks_of_time_divide_the_gram_row_of_a_whole_drive(warehouse: Warehous
     """Their columns are those of `windows`, and each row is in one of them."""
     land(warehouse, "one", hostile_drive("a", 5000, 4), hostile_drive("b", 40, 5))
     files = warehouse.logs.snapshot().files
-    wanted = ("ay_mean_16", "curvature_mean_64", "sideslip")
-    found = []
+    columns = ("ay_mean_16", "curvature_mean_64", "sideslip")
+    sums = []
     for feature_set in ("blocks", "windows"):
         rows = wide_grams(warehouse, files, feature_set)
-        totals = dict.fromkeys(("a", "b"), Gram.zero(wanted))
+        totals = dict.fromkeys(("a", "b"), Gram.zero(columns))
         for (name, signals), gram in grams_of(rows).items():
-            if set(wanted) <= set(signals):
-                totals[name[0]] += gram.restrict(wanted)
-        found.append((sum(rows["n"].to_pylist()), totals))
+            if set(columns) <= set(signals):
+                totals[name[0]] += gram.restrict(columns)
+        sums.append((sum(rows["n"].to_pylist()), totals))
         parts = set(rows["part"].to_pylist())
         blocks = {"block 0001", "block 0002", "block 0010"}
         assert parts >= blocks if feature_set == "blocks" else parts == {None}
-    assert found[0] == found[1]
-    assert found[0][0] == 5040
+    assert sums[0] == sums[1]
+    assert sums[0][0] == 5040
 
 
 @pytest.mark.parametrize("feature_set", ["windows", "gated", "course"])

@@ -1,4 +1,4 @@
-"""What may become champion: above the floor, no worse than the champion itself, and by people."""
+"""Conditions of a champion: above the floor, no worse than the current one, or set by a person."""
 
 import shutil
 from collections.abc import Callable
@@ -80,16 +80,16 @@ def test_a_reversed_label_is_no_champion(champion: Warehouse) -> None:
     assert registry_of(champion).versions("beta") == [1]
 
 
-def test_what_the_floor_lets_pass_must_still_be_as_good_as_the_champions_own_coefficients(
+def test_models_above_the_floor_must_be_as_good_as_the_coefficients_of_the_champion(
     champion: Warehouse,
 ) -> None:
     write(champion, "again", 48)
-    told = r"beta@1 as published has .* deg and .*, difference \d\.\d{4} \+- \S+ deg\."
-    with pytest.raises(RefusedError, match=told):
+    message = r"beta@1 as published has .* deg and .*, difference \d\.\d{4} \+- \S+ deg\."
+    with pytest.raises(RefusedError, match=message):
         publish_from(champion, "drive_id LIKE 'again%' OR drive_id LIKE 'good%'", "ay")
 
 
-def test_what_is_better_on_odd_new_drives_alone_waits(champion: Warehouse) -> None:
+def test_a_model_that_is_better_on_odd_new_drives_alone_waits(champion: Warehouse) -> None:
     write(champion, "odd", 8, label=1.25)
     with pytest.raises(
         RefusedError, match=r"differ from its training set\. .* of 8 drives that are new to both"
@@ -104,8 +104,8 @@ def test_no_champion_falls_while_the_drives_that_made_it_cannot_be_read(
 ) -> None:
     """With a flipped bit there, what is better on odd drives alone became champion."""
     write(champion, "odd", 8, label=1.25)
-    (kept,) = Path(str(registry_of(champion).versions_of("beta").folder)).glob("drives-*.bin")
-    kept.write_bytes(kept.read_bytes()[:-1] + b"x")
+    (document,) = Path(str(registry_of(champion).versions_of("beta").folder)).glob("drives-*.bin")
+    document.write_bytes(document.read_bytes()[:-1] + b"x")
     with pytest.raises(
         RefusedError, match=r"no comparison without the champion's training set: .*checksum"
     ):
@@ -118,10 +118,12 @@ def test_no_champion_falls_while_the_drives_that_made_it_cannot_be_read(
 
 
 def test_few_drives_are_no_reason_to_replace_a_champion_of_many(champion: Warehouse) -> None:
-    few = "drive_id IN ('good-0','good-1','good-2','good-3','good-4','good-5','good-6','good-9')"
+    predicate = (
+        "drive_id IN ('good-0','good-1','good-2','good-3','good-4','good-5','good-6','good-9')"
+    )
     with pytest.raises(RefusedError, match=r"on 8 drives, fewer than 24 .50% of the champion's 48"):
-        publish_from(champion, few)
-    assert publish_from(champion, few, force=True).new
+        publish_from(champion, predicate)
+    assert publish_from(champion, predicate, force=True).new
 
 
 def test_more_data_of_the_same_replaces_the_champion_and_says_what_was_compared(
@@ -150,12 +152,14 @@ def test_a_champion_has_no_advantage_on_drives_that_made_it(
     monkeypatch.setattr("tests.models.acceptance.test_champion_rules.ROWS", 12)
     strict = champion_rules.load_thresholds(CATALOG.configs).model_copy(update={"tolerance_deg": 0})
     monkeypatch.setattr(champion_rules, "load_thresholds", lambda _: strict)
-    every = ",".join((*CHOICE, *WEAK))
+    signals = ",".join((*CHOICE, *WEAK))
     write(warehouse, "good", 48, noise=400.0)
-    first = run_selection(warehouse, SelectionRequest(model=every))
-    made = publish_challenger(registry_of(warehouse), manifest_of(first, "beta"), first, force=True)
+    first = run_selection(warehouse, SelectionRequest(model=signals))
+    challenger = publish_challenger(
+        registry_of(warehouse), manifest_of(first, "beta"), first, force=True
+    )
     write(warehouse, "more", 16, noise=400.0)
-    version, answer = made.version, run_selection(warehouse, SelectionRequest(model=every))
+    version, answer = challenger.version, run_selection(warehouse, SelectionRequest(model=signals))
     assert not compare(answer, version).gap.negligible
     judged = champion_rules.review_challenger(
         registry_of(warehouse), version, manifest_of(answer, "beta"), answer
@@ -171,10 +175,10 @@ def test_a_search_is_made_again_without_the_cars_that_are_held_out(champion: War
     answer = run_selection(champion, request)
     winner = next(model for model in answer.models if len(model.signals) == 4)
     answer = replace(answer, winner=replace(answer.winner, model=winner))
-    found = compare(answer, version).challenger
+    challenger = compare(answer, version).challenger
     groups = answer.cohort.folds("vehicle", champion_rules.MAX_GROUPS).complete_cases(CHOICE, LABEL)
-    assert found.fold_names == groups.names
-    for figures, (training, test) in zip(found.folds, groups.splits(), strict=True):
+    assert challenger.fold_names == groups.names
+    for figures, (training, test) in zip(challenger.folds, groups.splits(), strict=True):
         sets = stepwise_order(training, CHOICE, LABEL, "forward", len(winner.signals))
         model = fit(training, sets[-1], LABEL).model
         scale = CATALOG.input_scales[LABEL]
@@ -182,7 +186,7 @@ def test_a_search_is_made_again_without_the_cars_that_are_held_out(champion: War
     fixed = cross_validate(
         "fixed", groups, least_squares(winner.signals, LABEL), CATALOG.input_scales
     )
-    assert found.pooled.rmse > fixed.pooled.rmse
+    assert challenger.pooled.rmse > fixed.pooled.rmse
 
 
 @pytest.mark.parametrize(("cars", "by", "groups"), [(8, "vehicle", 8), (4, "drive", 18)])
@@ -227,12 +231,12 @@ def test_a_person_sets_the_floor(
 ) -> None:
     usual = (Path(__file__).parents[3] / "configs" / "publish.toml").read_text()
     name = floor.partition(" ")[0]
-    kept = "\n".join(line for line in usual.splitlines() if not line.startswith(name))
-    own = tmp_path / "own"
-    own.mkdir()
-    (own / "publish.toml").write_text(f"{kept}\n{floor}\n")
+    text = "\n".join(line for line in usual.splitlines() if not line.startswith(name))
+    config_folder = tmp_path / "own"
+    config_folder.mkdir()
+    (config_folder / "publish.toml").write_text(f"{text}\n{floor}\n")
     with pytest.raises(RefusedError, match=problem):
-        publish_from(Warehouse(drives.root, Configs(own)))
+        publish_from(Warehouse(drives.root, Configs(config_folder)))
 
 
 def test_a_floor_that_cannot_be_read_lets_nothing_pass(more: Warehouse, tmp_path: Path) -> None:
@@ -278,21 +282,21 @@ def test_a_version_keeps_which_drives_made_it(champion: Warehouse) -> None:
     publish_from(champion, "adhesion < 0.5", force=True)
     assert models_trained_on(champion, ["good-3"]) == ["beta@1"]
     assert models_trained_on(champion, ["more-3", "unknown"]) == ["beta@2"]
-    made = [registry.trained_drives(registry.load("beta", one).manifest) for one in (1, 2)]
-    assert [len(one.salted) for one in made if one] == [48, 48]
+    trained = [registry.trained_drives(registry.load("beta", item).manifest) for item in (1, 2)]
+    assert [len(item.salted) for item in trained if item] == [48, 48]
     # The question of the first cohort, asked anew, would now have the other drives, too.
     assert forget(champion, ErasureSubject("drive", "more-3")).models == ("beta@2",)
 
 
 def test_drives_that_are_gone_or_damaged_count_as_trained_on(champion: Warehouse) -> None:
     folder = Path(str(registry_of(champion).versions_of("beta").folder))
-    (kept,) = folder.glob("drives-*.bin")
-    content = bytearray(kept.read_bytes())
+    (document,) = folder.glob("drives-*.bin")
+    content = bytearray(document.read_bytes())
     assert len(content) == 48 * 8
     content[3] ^= 1
-    kept.write_bytes(content)
+    document.write_bytes(content)
     assert models_trained_on(champion, ["unknown"]) == ["beta@1"]
-    kept.unlink()
+    document.unlink()
     assert models_trained_on(champion, ["unknown"]) == ["beta@1"]
 
 

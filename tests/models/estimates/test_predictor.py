@@ -39,26 +39,28 @@ def test_blocks_of_rows_have_the_bits_of_the_whole_drive() -> None:
             columns, predictor.coefficients, predictor.scales, strict=True
         ):
             expected += coefficient * (column * scale)
-        found = predictor(drive)
-        assert np.array_equal(found, expected, equal_nan=True)
-        assert np.isfinite(found).any() or rows == 1
+        angles = predictor(drive)
+        assert np.array_equal(angles, expected, equal_nan=True)
+        assert np.isfinite(angles).any() or rows == 1
 
 
 def frame_of(drive: DriveCounts, name: str) -> pl.DataFrame:
     """A drive in SI units."""
     columns = {
-        SIGNALS[one].column: pl.Series(
-            np.where(drive.present[one], counts * float(SIGNALS[one].scale), np.nan)
+        SIGNALS[column].column: pl.Series(
+            np.where(drive.present[column], counts * float(SIGNALS[column].scale), np.nan)
         )
-        for one, counts in drive.counts.items()
+        for column, counts in drive.counts.items()
     }
-    told = {name: drive.numbers.get(name) for name in NUMBERS}
+    counts_by_name = {name: drive.numbers.get(name) for name in NUMBERS}
     grains = {"yaw_rate_offset": 0.00000625, "speed_ratio": 0.0005, "understeer": 0.00002}
-    numbers = {one: None if n is None else n * grains[one] for one, n in told.items()}
+    numbers = {
+        column: None if n is None else n * grains[column] for column, n in counts_by_name.items()
+    }
     return pl.DataFrame({"drive_id": name, "tick": drive.ticks, **columns}).with_columns(
         pl.lit(drive.facts["mass_kg"]).alias("mass_kg"),
         pl.lit(drive.facts["vehicle_model"]).alias("vehicle_model"),
-        *(pl.lit(value, pl.Float64).alias(one) for one, value in numbers.items()),
+        *(pl.lit(value, pl.Float64).alias(column) for column, value in numbers.items()),
     )
 
 
@@ -66,11 +68,11 @@ def test_drives_that_are_mixed_have_the_angles_of_each_alone() -> None:
     version = ModelVersion(1, MANIFEST, "0" * 64, CATALOG)
     drives = {f"drive {seed}": drive_of(rows, seed) for rows, seed in ((1300, 1), (40, 2), (9, 5))}
     predictor = Predictor.from_manifest(SIGNALS, MANIFEST)
-    expected = np.concatenate([predictor(one) for one in drives.values()])
-    together = pl.concat([frame_of(one, name) for name, one in drives.items()])
-    found = version.predict(together).to_numpy()
-    assert np.array_equal(found, expected, equal_nan=True)
-    assert np.isfinite(found).sum() > 1000
+    expected = np.concatenate([predictor(drive) for drive in drives.values()])
+    together = pl.concat([frame_of(drive, name) for name, drive in drives.items()])
+    predicted = version.predict(together).to_numpy()
+    assert np.array_equal(predicted, expected, equal_nan=True)
+    assert np.isfinite(predicted).sum() > 1000
     mixed = together.with_row_index("place").sort("tick", "drive_id")
     angles = version.predict(mixed).to_numpy()[np.argsort(mixed["place"].to_numpy())]
     assert np.array_equal(angles, expected, equal_nan=True)
@@ -80,11 +82,11 @@ def test_threads_that_share_a_version_do_not_share_memory() -> None:
     version = ModelVersion(1, MANIFEST, "0" * 64, CATALOG)
     frames = [frame_of(drive_of(2000, seed), "drive") for seed in range(4)]
     expected = [
-        ModelVersion(1, MANIFEST, "0" * 64, CATALOG).predict(one).to_list() for one in frames
+        ModelVersion(1, MANIFEST, "0" * 64, CATALOG).predict(frame).to_list() for frame in frames
     ]
     with ThreadPoolExecutor(4) as pool:
-        found = [*pool.map(lambda one: version.predict(one).to_list(), frames * 8)]
-    assert found == expected * 8
+        angles = [*pool.map(lambda frame: version.predict(frame).to_list(), frames * 8)]
+    assert angles == expected * 8
 
 
 def test_a_frame_without_rows_has_no_angles() -> None:
