@@ -214,7 +214,7 @@ class TrafficStep(NamedTuple):
     curvature_1pm: float
     length_m: float
     positions_m: FloatArray
-    """Of all cars, in highway-env's plane, shape (cars, 2)."""
+    """Positions of all cars in the plane of highway-env, shape (cars, 2)."""
 
 
 def drive_in_traffic(
