@@ -213,3 +213,22 @@ def test_blanks_after_the_names_move_no_unit(tmp_path: Path) -> None:
     with open_source(tmp_path / "a.vbo", FileFormats()) as source:
         units = {channel.name: channel.unit for channel in source.channels()}
     assert (units["Yaw"], units["Latacc"]) == ("deg/s", "g")
+
+
+def test_a_line_without_end_is_refused(tmp_path: Path) -> None:
+    text = write(tmp_path / "a.vbo")
+    for line in ("1" * 2**21, "1 " * 2**22):
+        (tmp_path / "a.vbo").write_text(f"{text}{line}\n{text.rpartition('[data]')[2]}")
+        assert "a line is longer than 1,048,576 characters" in failure(
+            tmp_path / "a.vbo", mapping()
+        )
+
+
+def test_rows_are_the_same_in_pieces_of_any_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = write(tmp_path / "a.vbo").replace("\n", "\r\n") + "\r\n\r\n"
+    (tmp_path / "a.vbo").write_bytes(text.encode())
+    monkeypatch.setattr("fleet_slip.ingest.formats.vbo._BATCH_CHARACTERS", 100)
+    log = read_measured(tmp_path / "a.vbo", mapping())
+    assert (log.counts.rows_kept, log.counts.quarantined) == (ROWS, {})

@@ -7,13 +7,20 @@ in UTC and go on over midnight; the first line has the date.
 import re
 from collections.abc import Iterator
 from datetime import UTC, datetime
-from itertools import islice, takewhile
+from itertools import takewhile
 
 import numpy as np
 import polars as pl
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.ingest.formats.csv import CUT, EXTRA_FIELDS, FEWER, described, first_lines
+from fleet_slip.ingest.formats.csv import (
+    CUT,
+    EXTRA_FIELDS,
+    FEWER,
+    MAX_LINE_BYTES,
+    described,
+    first_lines,
+)
 from fleet_slip.ingest.formats.file_formats import CsvFormat
 from fleet_slip.ingest.formats.source import OWN_TIME, Budget, Channel, Source, find_column
 from fleet_slip.ingest.vocabulary import unit_called
@@ -21,7 +28,8 @@ from fleet_slip.ingest.vocabulary import unit_called
 VBO_BEGINS = re.compile(rb"(\xef\xbb\xbf)?\s*(file created on|\[header\])", re.IGNORECASE)
 _MAX_HEAD_LINES = 1000
 """Lines above the data."""
-_BATCH_LINES = 2**15
+_BATCH_CHARACTERS = 2**22
+"""Characters of rows that are split at once, and the rest of the last row."""
 _CREATED = re.compile(r"(\d+/\d+/\d{4})(?:\D+(\d+):(\d+))?")
 _TIME, _TIME_OF_DAY = "time", r"^(\d\d)([0-5]\d)([0-5]\d(?:\.\d+)?)$"
 _DAY_S = 86_400
@@ -91,9 +99,16 @@ class VboSource(Source):
         """Yield the columns as CSV does, with their times. Raises `InputError`."""
         _, time = self.find(_TIME)
         start_s, last_s = None, np.nan
-        with self._budget.file.open(encoding="utf-8", errors="replace") as text:
-            rows = islice(text, self._places["[data]"], None)
-            while lines := list(islice(rows, _BATCH_LINES)):
+        with self._budget.file.open(encoding="utf-8", errors="replace", newline="\n") as text:
+            for _ in range(self._places["[data]"]):
+                text.readline(MAX_LINE_BYTES)
+            while block := text.read(_BATCH_CHARACTERS):
+                end = text.readline(MAX_LINE_BYTES)
+                lines = f"{block}{end}".split("\n")
+                if len(end) == MAX_LINE_BYTES or max(map(len, lines)) > MAX_LINE_BYTES:
+                    raise self._budget.error(
+                        f"a line is longer than {MAX_LINE_BYTES:,} characters. Copy it again."
+                    )
                 fields = pl.Series(lines).str.replace_all(",", ".", literal=True)
                 fields = fields.str.extract_all(r"\S+").alias("fields")
                 fields = fields.filter(fields.list.len() > 0)
@@ -106,7 +121,7 @@ class VboSource(Source):
                     unwrapped_s = np.unwrap([last_s, *times_s[is_finite]], period=_DAY_S)[1:]
                     times_s[is_finite], last_s = unwrapped_s + start_s, unwrapped_s[-1]
                 columns = {n: fields.list.get(p, null_on_oob=True) for n, p in places.items()}
-                columns[EXTRA_FIELDS] = self._faults(fields, is_cut=not lines[-1].endswith("\n"))
+                columns[EXTRA_FIELDS] = self._faults(fields, is_cut=lines[-1] != "")
                 columns[OWN_TIME] = pl.Series(times_s).fill_nan(None)
                 as_numbers = [number for name, number in _AS_NUMBERS.items() if name in places]
                 yield pl.DataFrame(columns).with_columns(as_numbers)
