@@ -48,7 +48,9 @@ MAX_STEERING_RATIO = 1.0
 UNBIASED_STEERING = 0.8
 """Share of drives that must have such a ratio, of either sign, for its sign to mean anything: the
 wheels differ by some 0.04 deg in the mean, and sensors by more."""
-MIN_MEAN_RATIO = 0.5
+MIN_AGREEMENT, MAX_LONE_CORRELATION = 0.8, 0.5
+"""Correlation of witnesses that agree, and of one that has lost its sign with them."""
+MIN_MEAN_RATIO, MAX_TURNING_MEAN_RATIO = 0.5, 0.3
 """Mean over root mean square: a magnitude has about 0.8, a drive with bends to both sides 0.1."""
 
 
@@ -63,6 +65,7 @@ def check_moments(
     if len(_witnesses(moments).signals) >= MIN_WITNESSES:
         turning = find_reversed_or_swapped(moments, min_correlation)
         faults |= {drive: _join(several) for drive, several in turning.items()}
+        faults |= find_magnitudes(moments)
     return faults | find_swapped_axes(moments) | find_constant(table)
 
 
@@ -130,6 +133,33 @@ def find_reversed_or_swapped(
                 *signals, correlation=correlation, others=hint if agree[drive] else ""
             )
         faults.setdefault(drive, []).append(fault)
+    return faults
+
+
+def find_magnitudes(moments: MeanMoments) -> dict[int, Fault]:
+    """Return the drives in which a signal has lost its sign, which some buses send separately.
+
+    The mean of such a witness is far from zero. It hardly correlates with the others, which agree
+    with one another and turn to both sides.
+    """
+    witnesses = _witnesses(moments)
+    names, m = witnesses.signals, witnesses.matrices
+    means, squares = m[:, 0, 1:], np.diagonal(m, axis1=1, axis2=2)[:, 1:]
+    away = np.divide(np.abs(means), np.sqrt(squares), out=np.zeros_like(means), where=squares > 0)
+    agreement = np.abs(witnesses.correlations())
+    is_peer = ~np.eye(len(names), dtype=bool)
+    faults = {}
+    for i, name in enumerate(names):
+        if len(WITNESSES[name]) == 2:
+            continue
+        peers = is_peer[i]
+        within = agreement[:, peers][:, :, peers]
+        agree = np.median(within[:, ~np.eye(peers.sum(), dtype=bool)], axis=1) > MIN_AGREEMENT
+        lone = agreement[:, i, peers].max(axis=1) < MAX_LONE_CORRELATION
+        signed = np.median(away[:, peers], axis=1) < MAX_TURNING_MEAN_RATIO
+        for drive in np.flatnonzero(agree & lone & signed & (away[:, i] > MIN_MEAN_RATIO)).tolist():
+            evidence = f"mean {away[drive, i]:.0%} of its size, and the others turn to both sides"
+            faults[drive] = CHECKS["lost sign"].fault(*WITNESSES[name], evidence=evidence)
     return faults
 
 

@@ -259,6 +259,34 @@ def test_steering_of_cars_with_biased_sensors_is_not_called_swapped() -> None:
     assert examine_labels_too(cars).findings == ()
 
 
+SIDES = {"fl", "fr", "rl", "rr"}
+
+
+def there_and_mirrored(signals: Signals) -> Signals:
+    """Return the first half of a drive, and once more with left for right."""
+    found = {}
+    for name, values in signals.items():
+        other = name[:-1] + {"l": "r", "r": "l"}[name[-1]] if name[-2:] in SIDES else name
+        sign = 1 if name == "ax" or name.startswith("wheel") else -1
+        half = values.size // 2
+        found[name] = np.concatenate([values[:half], sign * signals[other][: values.size - half]])
+    return found
+
+
+def test_a_yaw_rate_without_its_sign_is_found() -> None:
+    rng = np.random.default_rng(9)
+    some = []
+    for number in range(4):
+        signals = there_and_mirrored(drive(rng))
+        if number == 2:
+            signals["yaw_rate"] = np.abs(signals["yaw_rate"])
+        some.append(driven(f"d{number}", signals))
+    found = {one.drive_id: one.fault for one in examine_labels_too(some).findings}
+    assert {name: (one.kind, one.signals) for name, one in found.items()} == {
+        "d2": ("magnitude", ("yaw_rate",))
+    }
+
+
 BEGAN = datetime(2024, 5, 31, 8, tzinfo=UTC)
 
 
