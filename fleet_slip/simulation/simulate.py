@@ -298,6 +298,11 @@ def simulate_campaign(
     snapshot = warehouse.logs.snapshot()
     days = tuple(days)
     open_days = _open_days(snapshot, campaign, days)
+    begun = {name.rpartition("/")[0] for name in snapshot.transactions}
+    for day in open_days:  # before the first write, so that a changed campaign is refused
+        if day_name(campaign.name, day) in begun:
+            for batch in campaign.batches(day):
+                has_landed(snapshot, batch_transaction(batch))
     plan = (campaign.batches(day) for day in open_days)
     report = _simulate(warehouse, plan, len(open_days), executor, progress, engine)
     report.campaign, report.days_present = campaign.name, len(days) - len(open_days)

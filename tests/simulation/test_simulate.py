@@ -82,6 +82,21 @@ def test_a_changed_campaign_is_refused_before_anything_is_written(tmp_path: Path
     assert (after.version, after.rows) == (before.version, before.rows)
 
 
+@pytest.mark.parametrize("index", [0, 1])
+def test_a_change_is_refused_before_the_first_write_if_a_later_day_is_half_written(
+    tmp_path: Path, index: int
+) -> None:
+    warehouse, plan = Warehouse(LocalFolder(tmp_path)), campaign(drives_per_day=2, rows_per_file=1)
+    batches = plan.batches(plan.days()[3])
+    assert len(batches) == 2
+    with ThreadPoolExecutor(1) as executor:
+        simulate_batches(warehouse, batches[index : index + 1], executor)
+    before = warehouse.logs.snapshot()
+    with pytest.raises(RefusedError, match="has changed"):
+        run(tmp_path, plan.model_copy(update={"seed": 77}), no_progress)
+    assert warehouse.logs.snapshot().version == before.version
+
+
 def test_a_complete_day_is_never_planned_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
