@@ -8,14 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from highway_env.vehicle.dynamics import BicycleVehicle
 
 from fleet_slip.base import no_progress
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import RefusedError
 from fleet_slip.resources import SHIPPED_CONFIGS
+from fleet_slip.simulation import simulate
 from fleet_slip.simulation.campaign import Batch, Campaign, load_campaign
 from fleet_slip.simulation.simulate import (
+    Engine,
     SimulationReport,
     lane_drive,
     simulate_batch,
@@ -25,6 +29,7 @@ from fleet_slip.simulation.simulate import (
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle import batch as lanes
 from fleet_slip.vehicle.highway import FourWheelVehicle, HighwayLanes
+from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.commands import RunCommand, run_on
@@ -95,6 +100,28 @@ def test_a_change_is_refused_before_the_first_write_if_a_later_day_is_half_writt
     with pytest.raises(RefusedError, match="has changed"):
         run(tmp_path, plan.model_copy(update={"seed": 77}), no_progress)
     assert warehouse.logs.snapshot().version == before.version
+
+
+def test_a_batch_is_rewritten_by_the_same_engine_after_an_erasure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse, plan = Warehouse(LocalFolder(tmp_path)), campaign(number_of_days=1, drives_per_day=2)
+    erased, remaining = plan.drives(plan.first_day)
+    written: list[tuple[tuple[str, ...], Engine]] = []
+
+    def simulate_and_erase(signals: SignalCatalog, batch: Batch, engine: Engine) -> pa.Table:
+        if not written:
+            subject = ErasureSubject("drive", erased.drive_id)
+            ErasureLog(warehouse.root).begin(subject, 1, [])
+        written.append((tuple(drive.drive_id for drive in batch.drives), engine))
+        return simulate_batch(signals, batch)
+
+    monkeypatch.setattr(simulate, "simulate_batch", simulate_and_erase)
+    with ThreadPoolExecutor(1) as executor:
+        report = simulate_campaign(warehouse, plan, plan.days(), executor, engine="highway-env")
+    both = (erased.drive_id, remaining.drive_id)
+    assert written == [(both, "highway-env"), ((remaining.drive_id,), "highway-env")]
+    assert (report.drives, report.drives_forgotten) == (1, 1)
 
 
 def test_a_complete_day_is_never_planned_again(
