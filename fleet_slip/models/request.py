@@ -1,5 +1,6 @@
 """How to select: the one definition of what `FleetCohort.select` and `fleet-slip select` take."""
 
+import difflib
 import json
 import math
 import re
@@ -250,6 +251,29 @@ class ModelList(Config):
         names = [candidate.name for candidate in self.model]
         if len(set(names)) < len(names):
             raise ValueError("two models have the same name")
+        return self
+
+    @model_validator(mode="after")
+    def _feature_set_has_the_columns(self, info: ValidationInfo) -> "ModelList":
+        if not isinstance(catalog := info.context, Catalog):
+            return self
+        try:
+            inputs = catalog.feature_set(self.features).inputs
+        except QuestionError as error:
+            raise ValueError(f"features: {str(error).rstrip('.')}") from None
+        columns = {f"model.{i}.signals": entry.signals for i, entry in enumerate(self.model)}
+        columns |= {f"search.{i}.inputs": entry.inputs or () for i, entry in enumerate(self.search)}
+        for key, name in ((key, name) for key, names in columns.items() for name in names):
+            if name not in inputs:
+                similar = " or ".join(difflib.get_close_matches(name, inputs, n=3))
+                hint = (
+                    f"Did you mean {similar}?"
+                    if similar
+                    else f"Its inputs: {name_inputs(catalog, inputs)}"
+                )
+                raise ValueError(
+                    f"{key}: {name} is not in the feature set {self.features!r}. {hint}"
+                )
         return self
 
     def absent_from(self, inputs: Sequence[str]) -> list[str]:

@@ -1,5 +1,6 @@
 """Choice of signals: orders, searches, and the error of the choice."""
 
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from sklearn.linear_model import LinearRegression
 from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
 
-from fleet_slip.errors import DataError
+from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.grams import cohort as folding
 from fleet_slip.grams.cohort import EACH, FoldCount, Folding, assign_folds
 from fleet_slip.models.request import (
@@ -16,6 +17,7 @@ from fleet_slip.models.request import (
     Search,
     SelectionPlan,
     SelectionRequest,
+    load_model_list,
 )
 from fleet_slip.models.select import choose_by, cross_validate_choice, select, select_models
 from fleet_slip.models.summary import Selection
@@ -39,6 +41,29 @@ def ordered(drives: list[Driven], **options: Any) -> Selection:
 
 def list_of(**content: Any) -> ModelList:
     return ModelList(description="one", **{"folds": FIVE, **content})
+
+
+@pytest.mark.parametrize(
+    ("entry", "problem"),
+    [
+        (
+            "[[model]]\nname = 'a'\nsignals = ['ay', 'yaw_rat']",
+            r"model\.0\.signals: yaw_rat is not in .*yaw_rate",
+        ),
+        (
+            "[[search]]\ninputs = ['ay', 'yaw_rat']",
+            r"search\.0\.inputs: yaw_rat is not in .*yaw_rate",
+        ),
+        ("features = 'window'\n[[model]]\nname = 'a'\nsignals = ['ay']", r"sets: signals, motion"),
+    ],
+)
+def test_a_list_with_an_unknown_column_or_feature_set_is_an_invalid_file(
+    tmp_path: Path, entry: str, problem: str
+) -> None:
+    file = tmp_path / "list.toml"
+    file.write_text(f"description = 'one'\n{entry}\n")
+    with pytest.raises(ConfigError, match=rf"list\.toml: .*{problem}"):
+        load_model_list(CATALOG, str(file))
 
 
 def test_an_order_is_chosen_from_with_cars_as_independent_units() -> None:
