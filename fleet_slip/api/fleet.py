@@ -625,6 +625,7 @@ class Fleet:
         from fleet_slip.models.request import DEFAULT_MODELS
 
         require_model_name(name)
+        day = date_of(night, "night") or date.today()
         with self._exclusive("nightly", name):
             return NightlyPipeline(
                 fleet=self,
@@ -633,7 +634,7 @@ class Fleet:
                 training=Training(name, cohort, models or DEFAULT_MODELS),
                 candidate=candidate,
                 retention=retention,
-                night=date_of(night, "night") or date.today(),
+                night=day,
                 workers=workers,
                 progress=progress,
             ).run()
