@@ -225,34 +225,71 @@ MAX_REVIEWED_DRIVES = 20_000
 _HEX = 4
 
 
-def _compare_unseen(
-    evaluation: ChallengerEvaluation, registry: Registry, champion: ModelVersion
-) -> Comparison | None:
-    """Compare on drives that the champion was not trained on: elsewhere it has an advantage.
-
-    Returns None if these are all drives, or of fewer than `MIN_VEHICLES` groups. Raises
-    `StorageError` if its training set cannot be read.
-    """
-    trained_drives = registry.trained_drives(champion.manifest)
-    cohort = evaluation.selection.cohort
-    if cohort.source is not None and cohort.sums is not None:
-        predicate, drives = cohort.predicate, cohort.drive_count
-        if drives > MAX_REVIEWED_DRIVES:
-            below = 16**_HEX * MAX_REVIEWED_DRIVES // drives
-            sample = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
-            predicate &= parse_predicate(cohort.catalog.signals, sample)
-        cohort = load_cohort(cohort.source, predicate, cohort.feature_set)
-    is_trained = trained_drives.among(hash_names(cohort.drives["drive_id"]))
-    with contextlib.suppress(DataError):  # fewer than two groups
-        unseen = evaluation.groups(cohort, ~is_trained)
-        if is_trained.any() and len(unseen.names) >= MIN_VEHICLES:
-            groups = evaluation.groups(cohort, np.ones_like(is_trained))
-            return replace(evaluation.compare(groups, unseen), unseen=True)
-    return None
-
-
 OUTLIER_RATIO = 2.0
 """Drives are unusual if the champion's RMSE on them exceeds this multiple of its usual RMSE."""
+
+
+@dataclass(frozen=True)
+class TrainingSplit:
+    """The drives of a selection, with the mask of those that the champion was trained on."""
+
+    evaluation: ChallengerEvaluation
+    cohort: Cohort
+    is_trained: BoolArray
+
+    @classmethod
+    def load(
+        cls, evaluation: ChallengerEvaluation, registry: Registry, champion: ModelVersion
+    ) -> "TrainingSplit":
+        """Split the drives. Raises `StorageError` if the champion's training set is unreadable."""
+        trained_drives = registry.trained_drives(champion.manifest)
+        cohort = evaluation.selection.cohort
+        if cohort.source is not None and cohort.sums is not None:
+            predicate, drives = cohort.predicate, cohort.drive_count
+            if drives > MAX_REVIEWED_DRIVES:
+                below = 16**_HEX * MAX_REVIEWED_DRIVES // drives
+                sample = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
+                predicate &= parse_predicate(cohort.catalog.signals, sample)
+            cohort = load_cohort(cohort.source, predicate, cohort.feature_set)
+        is_trained = trained_drives.among(hash_names(cohort.drives["drive_id"]))
+        return cls(evaluation, cohort, is_trained)
+
+    def compare_on(self, tested: Folds) -> Comparison:
+        """Compare on drives of the cohort, without whose groups the challenger is trained."""
+        groups = self.evaluation.groups(self.cohort, np.ones_like(self.is_trained))
+        return self.evaluation.compare(groups, tested)
+
+    def compare_unseen(self) -> Comparison | None:
+        """Compare on drives that the champion was not trained on: elsewhere it has an advantage.
+
+        Returns None if these are all drives, or of fewer than `MIN_VEHICLES` groups.
+        """
+        with contextlib.suppress(DataError):  # fewer than two groups
+            unseen = self.evaluation.groups(self.cohort, ~self.is_trained)
+            if self.is_trained.any() and len(unseen.names) >= MIN_VEHICLES:
+                return replace(self.compare_on(unseen), unseen=True)
+        return None
+
+    def problems(self) -> list[str]:
+        """Return a reason to refuse a challenger that is better on unusual new drives alone.
+
+        Trained on a part of them it is better on the others, and worse on the champion's.
+        """
+        with contextlib.suppress(DataError):  # fewer than two groups
+            trained = self.evaluation.groups(self.cohort, self.is_trained)
+            unseen = self.evaluation.groups(self.cohort, ~self.is_trained)
+            old, new = (
+                self.evaluation.as_published(tested).pooled.rmse_deg for tested in (trained, unseen)
+            )
+            if new > OUTLIER_RATIO * old:
+                comparison = self.compare_on(trained)
+                if not comparison.gap.negligible:
+                    return [
+                        "the improvement comes only from unusual new drives, on which the champion "
+                        f"has {new:.4f} deg: on its training set, {comparison}. Check the new "
+                        "drives before training"
+                    ]
+        return []
 
 
 def threshold_violations(
@@ -346,7 +383,8 @@ def review_challenger(
         return Review(tuple(problems), compared)
     try:
         evaluation = ChallengerEvaluation.prepare(selection, champion)
-        comparison = _compare_unseen(evaluation, registry, champion)
+        split = TrainingSplit.load(evaluation, registry, champion)
+        comparison = split.compare_unseen()
         if comparison is None:
             groups = evaluation.groups(selection.cohort)
             comparison = evaluation.compare(groups, groups)
@@ -361,6 +399,8 @@ def review_challenger(
         )
         return Review(tuple(problems), "")
     problems += _comparison_problems(comparison, champion, manifest)
+    if not problems:
+        problems += split.problems()
     return Review(tuple(problems), str(comparison), comparison.is_significantly_worse)
 
 

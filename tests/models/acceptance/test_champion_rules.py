@@ -89,11 +89,18 @@ def test_models_above_the_floor_must_be_as_good_as_the_coefficients_of_the_champ
         publish_from(champion, "drive_id LIKE 'again%' OR drive_id LIKE 'good%'", "ay")
 
 
-def test_a_model_that_is_better_on_odd_new_drives_alone_waits(champion: Warehouse) -> None:
-    write(champion, "odd", 8, label=1.25)
-    with pytest.raises(
-        RefusedError, match=r"differ from its training set\. .* of 8 drives that are new to both"
-    ):
+@pytest.mark.parametrize(
+    ("drives", "message"),
+    [
+        (8, r"differ from its training set\. .* of 8 drives that are new to both"),
+        (4, r"only from unusual new drives, .*: on its training set, .* of 48 drives, held out"),
+    ],
+)
+def test_a_model_that_is_better_on_odd_new_drives_alone_waits(
+    champion: Warehouse, drives: int, message: str
+) -> None:
+    write(champion, "odd", drives, label=1.25)
+    with pytest.raises(RefusedError, match=message):
         publish_from(champion)
     waiting = publish_from(champion, candidate=True)
     assert waiting.candidate and registry_of(champion).champion("beta") != waiting.version
