@@ -229,6 +229,14 @@ class Mapping(Config):
     where: tuple[RowCondition, ...] = added((), max_length=MAX_CONDITIONS)
     """Conditions on rows, as tables. A row that misses one is skipped and counted."""
 
+    @field_validator("where", mode="before")
+    @classmethod
+    def _is_no_text(cls, where: Any) -> Any:
+        if isinstance(where, str | dict):
+            example = '[{ column = "fix", one_of = ["4", "5"] }]'
+            raise ValueError(f"write it as tables: {example}")  # noqa: TRY004 - as of pydantic
+        return where
+
     @model_validator(mode="before")
     @classmethod
     def _asks_for_the_day(cls, content: Any) -> Any:

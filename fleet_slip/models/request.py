@@ -118,9 +118,13 @@ class SelectionRequest:
         has_criterion = self.ranking or self.criterion
         is_short = self.half_life is not None and self.half_life < 1
         conflicts = {
-            "leave out models, or order, ranking and criterion": self.models and self.is_ordered,
-            "leave out model, or models, order and search": self.model and other_models,
-            "leave out search, or ranking and criterion": self.search and has_criterion,
+            "models are compared by cross-validation: leave out models, or order, ranking and "
+            "criterion": self.models and self.is_ordered,
+            "model names the inputs: leave out model, or models, order, ranking, criterion and "
+            "search": self.model and other_models,
+            "a search is judged by folds alone: leave out search, or ranking and criterion": (
+                self.search and has_criterion
+            ),
             "max_features limits a search: add search": self.max_features and not self.search,
             "a prior works with a model list, one model or a search: leave out label, ranking, "
             "criterion, and order": self.prior and (self.label or self.is_ordered),

@@ -225,6 +225,7 @@ FORGED = (
         (["select", "--models", "table1", "--ranking", "forward"], 2, "leave out models"),
         (["select", "--model", "ax, vx"], 5, "vx is not an input"),
         (["select", "--model", "ax", "--search", "exchange"], 2, "search"),
+        (["select", "--model", "ax", "--ranking", "forward"], 2, "or models, order, ranking"),
         (["diagnose", "nothing"], 5, "no model is called"),
         (["diagnose", "smoke", "--signals", "ay"], 2, "not both"),
         (["diagnose", "--signals", "ay,ay"], 2, "appears twice"),

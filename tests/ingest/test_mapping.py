@@ -347,7 +347,8 @@ def test_rows_that_do_not_meet_the_conditions_are_counted(
 @pytest.mark.parametrize(
     ("where", "message"),
     [
-        ("speed > 5", "where\n  Input should be a valid tuple"),
+        ("speed > 5", "write it as tables"),
+        ({"column": "speed", "at_least": 1}, "write it as tables"),
         ([{"at_least": 1}], "column\n  Field required"),
         ([{"column": "speed"}], "needs either 'one_of', or bounds"),
         ([{"column": "speed", "at_least": 1, "one_of": ["a"]}], "needs either 'one_of', or bounds"),
