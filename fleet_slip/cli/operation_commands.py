@@ -59,7 +59,8 @@ def contract(
 def quality(context: Context, cohort: opt.Cohort = TRAINING_DRIVES, json: opt.Json = False) -> None:
     """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors, drive by drive.
 
-    Reads Gram rows only. Exit code 10 if a drive has faulty sensors.
+    Reads the Gram rows of all drives, and the log rows of the 20 longest measured drives.
+    Exit code 10 if a drive has faulty sensors.
 
     Example: fleet-slip quality --cohort "day >= '2024-05-02'"
     """
