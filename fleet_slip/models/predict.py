@@ -132,6 +132,12 @@ class Frame:
 _NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_null)
 
 
+def _array_of(values: Any) -> pa.Array:
+    """Return an Arrow array; texts of joined pandas frames become one chunk."""
+    column = pa.array(values, from_pandas=True)
+    return column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+
+
 def open_frame(frame: Any) -> Frame:
     """Return a frame of Polars, pandas, Arrow (any stream) or a mapping. Raises `InputError`."""
     polars, pandas = sys.modules.get("polars"), sys.modules.get("pandas")
@@ -144,7 +150,7 @@ def open_frame(frame: Any) -> Frame:
     if pandas and isinstance(frame, pandas.DataFrame):
         return Frame(
             list(frame.columns),
-            lambda name: pa.array(frame[name], from_pandas=True),
+            lambda name: _array_of(frame[name]),
             lambda values, name: pandas.Series(
                 values.to_numpy(zero_copy_only=False), frame.index, "float64", name
             ),
@@ -154,7 +160,7 @@ def open_frame(frame: Any) -> Frame:
     if isinstance(frame, Mapping):
         return Frame(
             list(frame),
-            lambda name: pa.array(frame[name], from_pandas=True),
+            lambda name: _array_of(frame[name]),
             lambda values, _: values.to_numpy(zero_copy_only=False),
         )
     if hasattr(frame, "__arrow_c_stream__"):

@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
 import numpy as np
+import pandas as pd
 import polars as pl
 import pyarrow as pa
 
@@ -75,6 +76,10 @@ def test_drives_that_are_mixed_have_the_angles_of_each_alone() -> None:
     assert np.isfinite(predicted).sum() > 1000
     mixed = together.with_row_index("place").sort("tick", "drive_id")
     angles = version.predict(mixed).to_numpy()[np.argsort(mixed["place"].to_numpy())]
+    assert np.array_equal(angles, expected, equal_nan=True)
+    parts = [frame_of(drive, name).to_pandas() for name, drive in drives.items()]
+    joined = pd.concat([part.astype({"drive_id": "str"}) for part in parts], ignore_index=True)
+    angles = version.predict(joined).to_numpy()  # its texts have several chunks
     assert np.array_equal(angles, expected, equal_nan=True)
 
 
