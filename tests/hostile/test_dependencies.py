@@ -1,6 +1,6 @@
 """Installed packages are the pinned ones, are compatible, and have usable licences.
 
-Known vulnerabilities are looked up by `pip-erasure_log`, which needs a network; this does not.
+Known vulnerabilities are looked up by `pip-audit`, which needs a network; this does not.
 """
 
 import re

@@ -264,25 +264,25 @@ SIDES = {"fl", "fr", "rl", "rr"}
 
 def there_and_mirrored(signals: Signals) -> Signals:
     """Return the first half of a drive, and once more with left for right."""
-    found = {}
+    halves = {}
     for name, values in signals.items():
         other = name[:-1] + {"l": "r", "r": "l"}[name[-1]] if name[-2:] in SIDES else name
         sign = 1 if name == "ax" or name.startswith("wheel") else -1
         half = values.size // 2
-        found[name] = np.concatenate([values[:half], sign * signals[other][: values.size - half]])
-    return found
+        halves[name] = np.concatenate([values[:half], sign * signals[other][: values.size - half]])
+    return halves
 
 
 def test_a_yaw_rate_without_its_sign_is_found() -> None:
     rng = np.random.default_rng(9)
-    some = []
+    drives = []
     for number in range(4):
         signals = there_and_mirrored(drive(rng))
         if number == 2:
             signals["yaw_rate"] = np.abs(signals["yaw_rate"])
-        some.append(driven(f"d{number}", signals))
-    found = {one.drive_id: one.fault for one in examine_labels_too(some).findings}
-    assert {name: (one.kind, one.signals) for name, one in found.items()} == {
+        drives.append(driven(f"d{number}", signals))
+    faults = {finding.drive_id: finding.fault for finding in examine_labels_too(drives).findings}
+    assert {name: (fault.kind, fault.signals) for name, fault in faults.items()} == {
         "d2": ("magnitude", ("yaw_rate",))
     }
 
