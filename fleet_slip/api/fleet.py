@@ -1,9 +1,9 @@
 """The fleet of a data root: its logs, Gram rows, queries and pipelines."""
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
-from dataclasses import replace as changed
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -276,11 +276,12 @@ class Fleet:
             If the cluster cannot be used.
         """
         from fleet_slip.ingest.logs import ingest_files
-        from fleet_slip.ingest.mapping import keep_assumptions
+        from fleet_slip.ingest.mapping import store_assumptions
         from fleet_slip.ingest.recordings import IngestCache
         from fleet_slip.operations.rewriting import build_removal
 
-        mapping, logs, from_folders = self._find_logs(files, mapping)
+        mapping = self._load_mapping(mapping)
+        logs, from_folders = self._find_logs(files, mapping)
         count = calls.total_progress(progress)
         reports: list[IngestReport] = []
         with calls.open_workers(self.root, workers) as executor, step("ingest") as figures:
@@ -291,15 +292,17 @@ class Fleet:
             warehouse = calls.for_workers(self.warehouse, executor)
             uses_cache = from_folders or replace == "corrected"
             cache = IngestCache.load(self.warehouse, mapping) if uses_cache else None
-            new_logs = logs if cache is None else cache.without_landed(logs, warehouse)
+            new_logs = logs if cache is None else cache.find_new_files(logs, warehouse)
             if skipped := len(logs) - len(new_logs):
                 count(skipped, len(logs))
+            # Threads read the small files of folders. A file that is named is read by all cores.
+            readers = executor if from_folders else remote
             try:
                 for report in ingest_files(
                     warehouse,
                     new_logs,
                     mapping,
-                    executor if from_folders else remote,
+                    readers,
                     cache,
                     replace,
                     partial(build_removal, self.warehouse),
@@ -313,7 +316,7 @@ class Fleet:
                 if cache is not None:
                     cache.save()
                 if any(report.new for report in reports):
-                    keep_assumptions(self.root, mapping)
+                    store_assumptions(self.root, mapping)
         order = {str(log): number for number, log in enumerate(logs)}
         return sorted(reports, key=lambda report: order[report.file])
 
@@ -360,7 +363,8 @@ class Fleet:
         """
         from fleet_slip.ingest.logs import preview_logs
 
-        mapping, logs, _ = self._find_logs(files, mapping)
+        mapping = self._load_mapping(mapping)
+        logs, _ = self._find_logs(files, mapping)
         return preview_logs(logs, mapping)
 
     @calls.record_call
@@ -448,13 +452,13 @@ class Fleet:
         Returns
         -------
         RunReport
-            What each step did. A winner that is worse than the champion is not published; the
+            Results of each step. A winner that is worse than the champion is not published; the
             report gives the reason.
 
         Raises
         ------
         FleetSlipError
-            What `simulate`, `gram`, `FleetCohort.select` and `FleetModels.publish` raise.
+            As `simulate`, `gram`, `FleetCohort.select` and `FleetModels.publish`.
         """
         from fleet_slip.api.pipelines import RunReport, Training
         from fleet_slip.models.manifest import require_model_name
@@ -515,15 +519,15 @@ class Fleet:
         Returns
         -------
         LearnReport
-            What each step did and assumed. Its `problem` is the error of files that could not be
-            used, a refusal to publish, or what looks wrong in the logs.
+            Results and assumptions of each step. Its `problem` is the error of files that could
+            not be used, a refusal to publish, or a fault in the logs.
 
         Raises
         ------
         ConfigError
             If the mapping is invalid or has neither label.
         FleetSlipError
-            What `ingest`, `gram` and `FleetCohort.select` raise.
+            As `ingest`, `gram` and `FleetCohort.select`.
         """
         from fleet_slip.api.pipelines import LearnReport, Training
         from fleet_slip.errors import InputError
@@ -550,7 +554,7 @@ class Fleet:
                 failure = error
             grams = training.gram(self, executor, progress)
             examined = self.cohort(training.cohort).examine()
-            training = changed(training, cohort=examined.cohort)
+            training = dataclasses.replace(training, cohort=examined.cohort)
             selection, publication, refusal = training.publish(self)
         return LearnReport(
             model=name,
@@ -558,7 +562,7 @@ class Fleet:
             ingested=tuple(reports),
             failure=failure,
             grams=grams,
-            selection=selection and changed(selection, examined=str(examined)),
+            selection=selection and dataclasses.replace(selection, examined=str(examined)),
             publication=publication,
             refusal=refusal,
             seconds=round(time.monotonic() - start, 3),
@@ -611,7 +615,7 @@ class Fleet:
         Returns
         -------
         NightReport
-            How each step went. Its `problem` is the first failure, else what needs attention.
+            Results of each step. Its `problem` is the first failure, else what needs attention.
 
         Raises
         ------
@@ -652,11 +656,10 @@ class Fleet:
         return mapping
 
     def _find_logs(
-        self, files: Iterable[Path | str] | Path | str, mapping: "str | Mapping"
-    ) -> "tuple[Mapping, list[Path], bool]":
-        """Return the mapping, the log files, and True if any is from a folder or pattern."""
+        self, files: Iterable[Path | str] | Path | str, mapping: "Mapping"
+    ) -> tuple[list[Path], bool]:
+        """Return the log files, and True if any is from a folder or pattern."""
         from fleet_slip.ingest.log_files import find_logs, names_several
 
-        mapping = self._load_mapping(mapping)
         paths = [files] if isinstance(files, Path | str) else list(files)
-        return mapping, find_logs(paths, mapping), any(map(names_several, paths))
+        return find_logs(paths, mapping), any(map(names_several, paths))

@@ -399,7 +399,7 @@ class FleetMaintenance:
         RefusedError
             If no drive would remain.
         FleetSlipError
-            What `forget` raises.
+            As `forget`.
         """
         from fleet_slip.operations.forget import load_retention, retain
 

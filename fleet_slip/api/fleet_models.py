@@ -1,8 +1,8 @@
 """Cohorts, and the models that are selected on them: publish, list, promote and export them."""
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
-from dataclasses import replace as changed
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -111,7 +111,7 @@ class FleetCohort:
         screen = self.examine()
         plan = ensure_rows(self.warehouse, plan, self.predicate, screen.cohort)
         selection = run_plan(self.warehouse, plan, screen.cohort, nested=nested)
-        return changed(selection, examined=str(screen))
+        return dataclasses.replace(selection, examined=str(screen))
 
     def diagnose(
         self,
@@ -149,7 +149,7 @@ class FleetCohort:
             return diagnose(cohort, inputs_of(cohort, signals or WHOLE_SET))
         registry = Registry.open(self.warehouse)
         if model is None:
-            model = registry.only(", or signals")
+            model = registry.only_name(", or signals")
         version = model if isinstance(model, ModelVersion) else registry.resolve(model)
         manifest = version.manifest
         diagnosis = diagnose(
@@ -157,7 +157,7 @@ class FleetCohort:
             manifest.signals,
             intercept=not manifest.through_origin,
         )
-        return changed(diagnosis, remark=manifest.line_remark)
+        return dataclasses.replace(diagnosis, remark=manifest.line_remark)
 
     def _load(self, feature_set: str) -> "Cohort":
 
@@ -250,7 +250,7 @@ class FleetModels:
         UsageError
             If the name is invalid.
         FleetSlipError
-            What `FleetCohort.select` raises.
+            As `FleetCohort.select`.
         """
         from fleet_slip.models.publish import publish_challenger
 

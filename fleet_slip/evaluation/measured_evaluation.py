@@ -61,7 +61,7 @@ from fleet_slip.models.prior import simulate_prior
 from fleet_slip.models.publish import (
     assumptions_of_cohort,
     manifest_of,
-    recipe_of,
+    training_options,
     with_straight_intercept,
 )
 from fleet_slip.models.registry import ModelVersion, Registry
@@ -452,7 +452,7 @@ class Competition:
                 estimate = partial(predict_drive, model, cars)
                 published[name] = FittedEstimator("as published", estimate)
             else:
-                recipes[name] = CHOSEN, recipe_of(version)[0]
+                recipes[name] = CHOSEN, training_options(version)[0]
         learners = {
             name: (source, Learner.prepare(warehouse, request, predicate, drives))
             for name, (source, request) in recipes.items()
@@ -542,7 +542,7 @@ class Competition:
 
 def prior_of(version: ModelVersion) -> Campaign | None:
     """Return the campaign of a version's prior, if it has one. Raises `ConfigError`."""
-    name = recipe_of(version)[0].prior if version.manifest.prior else None
+    name = training_options(version)[0].prior if version.manifest.prior else None
     return load_campaign(name, version.catalog.configs) if name else None
 
 

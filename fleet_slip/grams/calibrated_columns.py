@@ -36,7 +36,7 @@ def without_constant_columns(table: GramTable) -> GramTable:
     z, n, sums = table.signals.index(TURNED), table.n.astype(object), table.sums.astype(object)
     with_z = table.products[:, [packed_position(max(i, z), min(i, z)) for i in [*indices, z]]]
     about = n[:, None] * with_z.astype(object) - sums[:, [*indices, z]] * sums[:, [z]]
-    turns = np.where(about[:, -1] == 0, 1, about[:, -1])  # straight driving: the others are 0, too
+    turns = np.where(about[:, -1] == 0, 1, about[:, -1])  # on straights the other terms are 0, too
     below = (n * turns).astype(np.float64)[:, None]
     means, slopes = table.sums[:, indices].astype(np.float64), about[:, :-1].astype(np.float64)
     row, column = np.tril_indices(len(indices))

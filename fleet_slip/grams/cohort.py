@@ -161,18 +161,18 @@ class Cohort:
     logs_version, grams_version, feature_set
         The data that were read.
     left_out
-        Number of drives without such Gram rows because their cars sent no log.
+        Number of drives without Gram rows of the feature set, since their cars sent no log.
     drives
         Metadata of each Gram row: drive, car, signals, number of rows.
     tables
         The Gram rows in the order of `drives`, by signals; empty if only `sums` were read.
     sums, folding
-        The Gram of each fold and the division into folds, if only these were read.
+        The Gram of each fold, and the division into folds; None if Gram rows were read.
     source
         Warehouse or reader of the Gram rows.
     prior, weight
-        Gram rows of simulated drives that belong to the training set of every fold,
-        and the weight of their rows; rows of the cohort have the weight 1.
+        Gram rows of simulated drives in the training set of every fold, and the weight of
+        their rows. Rows of the cohort have the weight 1.
     """
 
     catalog: Catalog
@@ -284,15 +284,15 @@ class Cohort:
         return replace(self, tables=tuple(tables), drives=self.drives.filter(pa.array(mask)))
 
     def weighted(self, weights: IntArray) -> "Cohort":
-        """Return the cohort with its Gram rows times integer weights, and the prior times `FULL`.
+        """Return the cohort with its Gram rows times integer weights.
 
-        Rows of weight zero are dropped.
+        The weight of the prior is `FULL_WEIGHT`. Rows of weight zero are dropped.
         """
         cohort = self.filter(weights > 0)
         factors = cohort._split(weights[weights > 0])
         prior = self.prior
         if prior is not None:
-            prior = prior.weighted(np.full(len(prior.drives), FULL))
+            prior = prior.weighted(np.full(len(prior.drives), FULL_WEIGHT))
         tables = tuple(weighted(*pair) for pair in zip(cohort.tables, factors, strict=True))
         return replace(cohort, tables=tables, prior=prior)
 
@@ -413,7 +413,7 @@ def empty_cohort_error(opened: OpenedGrams, predicate: Predicate) -> DataError:
 # Sums of a cohort over its folds, from Gram rows read batch by batch.
 
 FoldOf = Callable[[pa.RecordBatch], IntArray]
-"""Returns the fold of each Gram row from its metadata."""
+"""Function that returns the fold of each Gram row from its metadata."""
 
 
 def _add_up(
@@ -443,9 +443,9 @@ def _find_folds(
 ) -> tuple[Sequence[str], FoldOf]:
     """Return the names of the folds, and the function that finds the fold of a Gram row."""
     key = FOLD_KEYS[folding.by]
-    by_hash = folding.by in ("drive", "vehicle") and folding.count != EACH
-    values = opened.values_of(key, predicate, int(folding.count) + 1 if by_hash else None)
-    if by_hash and len(values) > (count := int(folding.count)):
+    is_hashable = folding.by in ("drive", "vehicle") and folding.count != EACH
+    values = opened.values_of(key, predicate, int(folding.count) + 1 if is_hashable else None)
+    if is_hashable and len(values) > (count := int(folding.count)):
         hash_column = key.removesuffix("_id") + "_hash"
         names = [str(fold + 1) for fold in range(count)]
         return names, lambda rows: (rows[hash_column].to_numpy() % count).astype(np.int64)
@@ -540,10 +540,10 @@ def clustered_moments(cases: CompleteCases, *, intercept: bool = True) -> DriveM
 
 # Integer weights of drives: Gram rows times a weight keep every sum exact.
 #
-# Weights are multiples of 1 / `FULL`, a power of two. Robust weights are lower for drives whose
-# error is far above that of the median drive, such as drives with a lost label or signal.
+# Weights are multiples of 1 / `FULL_WEIGHT`, a power of two. Robust weights are lower for drives
+# whose error is far above that of the median drive, such as drives with a lost label or signal.
 
-FULL = 16
+FULL_WEIGHT = 16
 """Weight of a usual drive."""
 USUAL_ERRORS = 3.0
 """Error of a drive over that of the median drive, beyond which its weight is lower."""
@@ -580,14 +580,16 @@ class DownweightedDrive(Record):
 
 @dataclass(frozen=True)
 class DriveWeights:
-    """Weight of each drive in parts of `FULL`, and `DownweightedDrive.times`; shape (drives,)."""
+    """Integer weight of each drive, and `DownweightedDrive.times`; both of shape (drives,)."""
 
     weights: IntArray
     times: FloatArray
 
     def drive(self, number: int) -> DownweightedDrive:
         """Return weight and error of a drive."""
-        return DownweightedDrive(float(self.weights[number]) / FULL, float(self.times[number]))
+        return DownweightedDrive(
+            float(self.weights[number]) / FULL_WEIGHT, float(self.times[number])
+        )
 
 
 def robust_weights(drives: DriveMoments) -> DriveWeights:
@@ -598,7 +600,9 @@ def robust_weights(drives: DriveMoments) -> DriveWeights:
     """
     moments, rows, limit = drives.moments, drives.moments[:, 0, 0], USUAL_ERRORS
     result = _reweight(moments, rows, limit)
-    while float(rows @ (FULL - result.weights)) > MAX_LOST_SHARE * FULL * float(rows.sum()):
+    while float(rows @ (FULL_WEIGHT - result.weights)) > MAX_LOST_SHARE * FULL_WEIGHT * float(
+        rows.sum()
+    ):
         limit *= 1.25
         result = _reweight(moments, rows, limit)
     return result
@@ -607,7 +611,7 @@ def robust_weights(drives: DriveMoments) -> DriveWeights:
 def age_weights(days: Sequence[date], half_life_days: int) -> IntArray:
     """Return weights of drives that halve with each half-life of age before the newest day."""
     age = np.array([(max(days) - day).days for day in days])
-    return np.rint(FULL * 0.5 ** (age / half_life_days)).astype(np.int64)
+    return np.rint(FULL_WEIGHT * 0.5 ** (age / half_life_days)).astype(np.int64)
 
 
 def weighted(table: GramTable, weights: IntArray) -> GramTable:
@@ -621,16 +625,18 @@ def weighted(table: GramTable, weights: IntArray) -> GramTable:
 
 def _reweight(moments: FloatArray, rows: FloatArray, limit: float) -> DriveWeights:
     """Fit and weight in turn until no weight changes; the label is the last of the moments."""
-    weights = np.full(len(moments), FULL, dtype=np.int64)
+    weights = np.full(len(moments), FULL_WEIGHT, dtype=np.int64)
     for _ in range(MAX_ROUNDS):
         total = np.einsum("d,dij->ij", weights.astype(np.float64), moments)
         slopes = np.linalg.pinv(total[:-1, :-1], rcond=1e-13, hermitian=True) @ total[:-1, -1]
         error = np.append(slopes, -1.0)
         squares = np.maximum(np.einsum("i,dij,j->d", error, moments, error), 0.0) / rows
         if not (median := float(np.median(squares))):
-            return DriveWeights(np.full(len(moments), FULL, dtype=np.int64), np.ones(len(moments)))
+            return DriveWeights(
+                np.full(len(moments), FULL_WEIGHT, dtype=np.int64), np.ones(len(moments))
+            )
         times = np.sqrt(squares / median)
-        update = np.rint(FULL * (limit / np.maximum(times, limit)) ** 2)
+        update = np.rint(FULL_WEIGHT * (limit / np.maximum(times, limit)) ** 2)
         if np.array_equal(update, weights):
             break
         weights = update.astype(np.int64)

@@ -43,13 +43,13 @@ from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.warehouse import Warehouse
 
 CourseDelays = Mapping[str, int] | None
-"""Delay of the course of each car in parts of a tick; 0 for other cars."""
+"""Delay of the course of each car in `LATE_PARTS` of a tick; 0 for other cars."""
 
 # Rows of drives, one drive at a time in the order of time, from log files or a query.
 
 
 def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iterator[DriveCounts]:
-    """Yield the drives of a log file, with their metadata as facts and rows in the order of time.
+    """Yield the drives of a log file, with their metadata as facts and rows sorted by time.
 
     As in SQL, a drive without a row of tick 0 is skipped.
     """
@@ -73,11 +73,12 @@ def counts_of(
     rows: pa.Table,
     plan: ColumnPlan,
     facts: Mapping[str, Any] | None = None,
-    numbers: Mapping[str, int] | None = None,
+    parameters: Mapping[str, int] | None = None,
 ) -> DriveCounts:
-    """Return the rows of a drive in the order of time as the input of a column plan.
+    """Return the rows of a drive, sorted by time, as the input of a column plan.
 
-    `facts` default to those of the first row; `numbers` are the calibration parameters of the car.
+    `facts` are the metadata that the plan uses, by default those of the first row. `parameters` are
+    the counts of the calibration parameters of the car.
     """
     counts, present = {}, {}
     for name in plan.signals:
@@ -92,7 +93,7 @@ def counts_of(
         counts[name] = column.to_numpy()
     if facts is None:
         facts = {name: rows[name][0].as_py() for name in plan.facts}
-    return DriveCounts(rows["tick"].to_numpy(), counts, present, facts, numbers or {})
+    return DriveCounts(rows["tick"].to_numpy(), counts, present, facts, parameters or {})
 
 
 def drives_of_stream(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
@@ -142,7 +143,7 @@ def block_name(feature_set: FeatureSet, number: int) -> str | None:
 _INT64 = 2**63
 
 
-def wide_grams(
+def by_kernel(
     warehouse: Warehouse, files: Sequence[TableFile], feature_set: str, delays: CourseDelays = None
 ) -> pa.Table:
     """Return the Gram rows of log files for a feature set, sorted as by `jobs/gram.sql`.
@@ -239,7 +240,7 @@ Pattern = tuple[int, int]
 def drive_sums(
     plan: ColumnPlan, feature_set: FeatureSet, counts: DriveCounts
 ) -> dict[Pattern, BlockSums]:
-    """Return the sums of the rows of a drive by pattern; raises as `wide_grams`."""
+    """Return the sums of the rows of a drive by pattern; raises as `by_kernel`."""
     _require_64_bits(len(counts.ticks), max(plan.limits))
     sums: dict[Pattern, BlockSums] = {}
     ticks = counts.ticks.astype(np.int64)
@@ -340,9 +341,9 @@ class Fixes:
     def changes(self, duration: int) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return the changes between fixes that are `duration` ticks apart.
 
-        Returns the rows of the later fixes, the columns, and the number of clipped values of each.
-        Columns have shape (columns, changes), end with `AUXILIARY` and the label, and are NaN where
-        missing.
+        Returns the rows of the later fixes, the columns of the changes, and the number of clipped
+        values of each change. The columns have the shape (columns, changes). The last ones are
+        `AUXILIARY` and the label. Missing values are NaN.
         """
         rows, yaw_rate, units = self.rows, self.yaw_rate, self.units
         before, now = _pair_fixes(self.ticks[rows], duration)
@@ -356,7 +357,7 @@ class Fixes:
         fastest = np.maximum(np.abs(yaw_rate[rows[before]]), np.abs(yaw_rate[rows[now]]))
         straight = (fastest <= units.slow) & (np.abs(turned) <= units.unturned)
         auxiliary = [_divide_rounded(turned, TURNED_DIVISOR), straight, straight * change]
-        # The first row has no change: it records a drive without a course.
+        # A row without a change precedes the changes: it represents drives without a course.
         is_start = self.ticks[:1] == 0
         offset, size = int(is_start.sum()), len(self.counts)
         columns = np.full((size + len(auxiliary) + 1, offset + len(now)), np.nan)
@@ -387,7 +388,10 @@ def _pair_fixes(ticks: IntArray, duration: int) -> tuple[IntArray, IntArray]:
 def _twice_turned(
     ticks: IntArray, yaw_rate: FloatArray, before: IntArray, now: IntArray
 ) -> tuple[IntArray, BoolArray]:
-    """Return J between pairs of rows, and a mask of pairs without a missing yaw rate between."""
+    """Return J of `catalog.course`, twice the integral of the yaw rate, between pairs of rows.
+
+    Also returns a mask of pairs without a missing yaw rate or tick between them.
+    """
     missing = np.isnan(yaw_rate)
     counts = np.where(missing, 0.0, yaw_rate).astype(np.int64)
     total, gaps = np.cumsum(counts), np.cumsum(missing)
@@ -456,8 +460,8 @@ def gram_statement(
     used = catalog.rows(resolved.features)
     logs = with_absent(signals, LOGS, absent)
     rows = with_columns(logs, used, windows)
-    wide = windows or any(feature.bits > COUNT_BITS for feature in used.values())
-    kind = "BIGINT" if wide else "INTEGER"
+    needs_64_bits = windows or any(feature.bits > COUNT_BITS for feature in used.values())
+    kind = "BIGINT" if needs_64_bits else "INTEGER"
     pairs = ((a, b) for i, a in enumerate(names) for b in names[: i + 1])
     return read_sql("jobs", "gram.sql").format(
         drive_columns=", ".join(
@@ -513,15 +517,18 @@ def compute_grams(
     if not files:
         return
     resolved = warehouse.catalog.feature_set(feature_set)
-    wide = bool(resolved.windows or resolved.block_ticks)
-    # DuckDB has threads of its own; the kernel has one.
-    local = LocalThreads(cpu_count() or 1) if wide and not executor else nullcontext(executor)
+    uses_kernel = bool(resolved.windows or resolved.block_ticks)
+    # The kernel runs on one thread, DuckDB on several.
+    is_local = uses_kernel and not executor
+    local = LocalThreads(cpu_count() or 1) if is_local else nullcontext(executor)
     with local as workers:
         size = ceil(len(files) / in_flight(executor)) if executor else FILES_PER_QUERY
-        step = 1 if wide else min(FILES_PER_QUERY, size)
+        step = 1 if uses_kernel else min(FILES_PER_QUERY, size)
         groups = [files[first : first + step] for first in range(0, len(files), step)]
         threads = 1 if executor else None
-        compute = partial(wide_grams, delays=delays) if wide else partial(by_sql, threads=threads)
+        compute = partial(by_sql, threads=threads)
+        if uses_kernel:
+            compute = partial(by_kernel, delays=delays)
         task = partial(compute, warehouse, feature_set=feature_set)
         total = sum(file.rows for file in files)
         early: dict[str, pa.Table] = {}  # by the first file of a group

@@ -74,13 +74,13 @@ class OnboardFeatureSet:
     Attributes
     ----------
     name, identity
-        Of the feature set.
+        Name and identity of the feature set.
     ranges
         Smallest and largest count of each column, in order.
     signals
         Source signals, in the order of the catalog.
     times
-        Durations of changes in ticks; empty for a feature set of the columns themselves.
+        Durations of changes in ticks; empty for a feature set without changes.
     blocks
         Names of the blocks of a drive; None for an undivided drive.
     in_time
@@ -167,9 +167,9 @@ def _range(catalog: Catalog, column: str, times: Sequence[int]) -> Range:
 
 # Validity of Gram rows of integer counts.
 #
-# Of n rows whose counts x of a signal are from l to h, with the sum s, and c the sum of products of
-# two signals x and y: n l <= s <= n h, and |c| <= n max|x| max|y|, in 64 bits: n is so small
-# (`max_gram_rows`) that nothing reaches 2^63. The matrix of n, sums and products is positive
+# Let the counts x of a signal in n rows be from l to h, with the sum s, and let c be the sum of the
+# products of two signals x and y. Then n l <= s <= n h, and |c| <= n max|x| max|y|. All fit into 64
+# bits, since `max_gram_rows` limits n. The matrix of n, sums and products is positive
 # semidefinite: scaled to a diagonal of ones, its smallest eigenvalue is not below zero by more than
 # the rounding error (Higham, Accuracy and Stability of Numerical Algorithms, section 10.1).
 
@@ -272,7 +272,7 @@ BATCH_ROWS_READ = 2**12
 MAX_ROWS_OF_A_DAY = 86_400 * round(1 / SAMPLE_TIME_S)
 """Maximum number of rows of the drives of a car that begin on one day: 24 hours."""
 ONE_AT_A_TIME = "receive"
-"""Transaction of all imports: two at the same time, perhaps of one drive, are a conflict."""
+"""Transaction of every import, so that two imports at the same time are a conflict."""
 
 
 @dataclass(frozen=True)
@@ -353,7 +353,7 @@ def _read(file: Path, content: bytes) -> pa.Table:
 def _documented_columns(file: Path, schema: pa.Schema) -> list[str]:
     """Return the columns of `COLUMNS` in a file.
 
-    Raises `InputError` for missing ones, and for those that decode to other values than counted.
+    Raises `InputError` for a missing or repeated column, and for a column of another type.
     """
     columns = [name for name in COLUMNS.names if name in schema.names]
     if missing := set(COLUMNS.names).difference(columns, OPTIONAL):
@@ -455,7 +455,7 @@ def _pages_of(content: bytes, chunk: dict[int, Any]) -> Iterator[Page]:
 
 
 def _field(fields: Any, number: int, kind: type) -> Any:
-    """Return a field of a struct. Raises `ValueError` if it is missing, negative or no `kind`."""
+    """Return a field of a struct. Raises `ValueError` if missing, negative or of another type."""
     value = fields.get(number) if isinstance(fields, dict) else None
     if not isinstance(value, kind) or (isinstance(value, int) and value < 0):
         raise ValueError(f"the field {number} of a struct is not as it must be")
@@ -491,7 +491,7 @@ class _ThriftReader:
         raise ValueError("a number is too long")
 
     def _value(self, kind: int) -> Any:
-        """Return a value of a type; that of a Boolean is its type."""
+        """Return a value of a type. The type of a Boolean contains its value."""
         match kind:
             case 1 | 2:
                 return kind == 1

@@ -153,10 +153,10 @@ def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list
         if grams.transaction_version(transaction_name(identity)) is None:
             continue
         paths = None
-        if warehouse.catalog.feature_set(name).windows:  # of the drives that had them, not of all
+        if warehouse.catalog.feature_set(name).windows:  # only the drives that had Gram rows before
             drives = _distinct(grams, identity, "drive_id")
-            plain = warehouse.grams.snapshot()
-            paths = set(_distinct(plain, PLAIN, "file", drives).to_pylist())
+            current = warehouse.grams.snapshot()
+            paths = set(_distinct(current, PLAIN, "file", drives).to_pylist())
         if unreadable:
             active = {file.path for file in warehouse.logs.snapshot().files}
             paths = (active if paths is None else paths).difference(unreadable)
@@ -169,7 +169,7 @@ def _distinct(
 ) -> pa.Array:
     """Return the distinct values of a column in the Gram rows of a feature set, or some drives."""
     values = [pa.array([], pa.string())]
-    for rows in rows_of_set(grams, identity, *{"drive_id", column}):
+    for rows in rows_of_set(grams, identity, *dict.fromkeys(["drive_id", column])):
         texts = rows[column].cast(pa.string())
         if drives is not None:
             texts = texts.filter(pc.is_in(rows["drive_id"].cast(pa.string()), drives))
@@ -211,8 +211,8 @@ def _update_set(
         rows = compute_grams(warehouse, work.files, progress, feature_set, executor, work.delays)
         added, replaced, superseded = _write_files(warehouse, work, rows)
         _commit(work.grams, work.logs, work.identity, added, replaced)
-        # Who removed a log file may have found no Gram row of its drives, and so changed none: the
-        # next attempt drops the rows that were committed here.
+        # A process that removed a log file meanwhile did not drop the rows that were committed
+        # here. After this conflict the next attempt drops them.
         require_active(work.logs.refresh(), work.files)
         grams = warehouse.grams.snapshot()
     return GramReport(
@@ -236,13 +236,13 @@ class _Work:
     grams, logs
         The snapshots that were compared.
     identity
-        Of the feature set.
+        Identity of the feature set.
     files
         Log files to read: those without Gram rows, and the outdated ones.
     outdated
         Paths of log files whose Gram rows have another course delay than their cars.
     stale
-        Paths in `grams` that are no active log file.
+        Paths in `grams` that are not active log files.
     delays
         Course delay of each car, for feature sets that are corrected for it.
     """
@@ -260,8 +260,8 @@ def _find_work(
     warehouse: Warehouse, feature_set: str, paths: Collection[str] | None = None
 ) -> _Work:
     """Compare the Gram rows of a feature set with the log files, or some; change nothing."""
-    # The snapshot of the logs is the later one. Who removes a drive from the logs after it changes
-    # the Gram rows after the snapshot of these, and a commit on that snapshot is a conflict.
+    # The Gram rows are opened first. A process that removes a drive from the logs changes its Gram
+    # rows afterwards, so that a commit on this snapshot of the Gram rows is a conflict.
     grams = warehouse.grams.snapshot()
     logs = warehouse.logs.snapshot()
     identity = warehouse.catalog.identity(feature_set)
@@ -289,10 +289,10 @@ def _delays(
 def _write_files(
     warehouse: Warehouse, work: _Work, new_rows: Iterable[pa.Table]
 ) -> tuple[list[AddAction], list[TableFile], int]:
-    """Write new Gram rows, and those that remain of the files that the commit replaces.
+    """Write new Gram rows, and the remaining rows of the Gram files that the commit replaces.
 
-    Returns the actions that add files, the replaced files, and the number of Gram rows from cars
-    that logs of the same drives supersede.
+    Returns the actions that add files, the replaced files, and the number of dropped Gram rows from
+    cars: logs of the same drives supersede them.
     """
     grams, writer, logged = work.grams, GramWriter(warehouse), []
     has_onboard = any(is_onboard_file(file) for file in grams.files)
@@ -354,7 +354,7 @@ def _commit(
 
 
 def _as_file(action: AddAction) -> TableFile:
-    """Return a file that is not committed yet as a file of a snapshot."""
+    """Return an uncommitted file as a file of a snapshot."""
     statistics = json.loads(action.stats)
     day = action.partition_values.get("day")
     return TableFile(
@@ -375,7 +375,7 @@ can be equal by chance."""
 
 
 def find_eventful(table: GramTable) -> BoolArray:
-    """Return a mask of the Gram rows that vary too much to be equal in two drives."""
+    """Return a mask of the Gram rows that vary too much to be equal by chance in two drives."""
     n, column = table.n[:, None], np.arange(len(table.signals))
     variances = table.products[:, column * (column + 3) // 2] / n - (table.sums / n) ** 2
     varying: BoolArray = (variances >= 1).sum(axis=1) >= MIN_EVENTFUL_SIGNALS
@@ -395,13 +395,13 @@ def gram_digests(rows: pa.Table) -> tuple[list[str], BoolArray]:
             numbers = np.column_stack([table.n, table.sums, table.products])
             eventful[mask] = is_eventful = find_eventful(table)
         names = alike.select(["feature_set", "part", "vehicle_id", "day"]).to_pylist()
-        of_rows = []
-        for name, alone, row in zip(names, is_eventful, numbers, strict=True):
-            owner = "" if alone else f"{name['vehicle_id']}\n{name['day']}"
+        row_digests = []
+        for name, is_unique, row in zip(names, is_eventful, numbers, strict=True):
+            owner = "" if is_unique else f"{name['vehicle_id']}\n{name['day']}"
             text = f"{name['feature_set']}\n{name['part'] or ''}\n{signals}\n{owner}\n"
             content = text.encode() + row.tobytes()
-            of_rows.append(blake2b(content, digest_size=8).hexdigest())
-        digests[mask] = of_rows
+            row_digests.append(blake2b(content, digest_size=8).hexdigest())
+        digests[mask] = row_digests
     return digests.tolist(), eventful
 
 
@@ -441,7 +441,7 @@ class GramWriter:
         return self._actions
 
     def _flush(self) -> None:
-        """Write a file for each feature set, and others for rows from cars."""
+        """Write a file for each feature set, and separate files for rows from cars."""
         rows = pa.concat_tables(self._buffer, promote_options="default")  # optional columns differ
         self._buffer.clear()
         table, onboard = self._warehouse.grams, is_onboard(rows)
@@ -468,7 +468,7 @@ def _only(rows: pa.Table, mask: pa.ChunkedArray) -> pa.Table:
 
 
 def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
-    """Return the Gram files that name stale log files, and small ones to merge, if too many."""
+    """Return the Gram files with rows of stale log files, and small files to merge, if too many."""
     merged = _files_to_merge(grams)
     return [
         file
@@ -481,7 +481,7 @@ def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
 
 
 def _files_to_merge(grams: Snapshot) -> set[str]:
-    """Return small files that fill two files together, if there are too many small ones."""
+    """Return small files to merge into two full ones, if there are too many small files."""
     small = sorted((_fullness(file), file.path) for file in grams.files if _fullness(file) < 1)
     if len(small) <= SMALL_FILES_MAX:
         return set()
@@ -490,7 +490,7 @@ def _files_to_merge(grams: Snapshot) -> set[str]:
 
 
 def _fullness(file: TableFile) -> float:
-    """Return the size of a file over that of a full one; encoding saves up to three quarters."""
+    """Return the size of a file over that of a full file; encoding saves up to three quarters."""
     return max(file.rows / FILE_ROWS, file.size_bytes / (FILE_BYTES / 4))
 
 

@@ -1,8 +1,8 @@
 """Reads the rows of a log in bounded batches.
 
 A batch is a Polars frame with the columns that a mapping uses: text (CSV, text in Parquet), 64-bit
-floats, dates or timestamps. CSV fields stay text, so that what is not a number can be quarantined
-as it was written.
+floats, dates or timestamps. CSV fields stay text, so that the quarantine can store other texts than
+numbers as they were written.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -67,7 +67,7 @@ def _with_times(
 ) -> Iterator[pl.DataFrame]:
     """Yield the rows that have a time, with their times in s. Raises `InputError`.
 
-    A text that is no time is NaN. Rows without a time are those of other, longer columns.
+    Other texts than times are NaN. Rows without a time belong to other, longer columns.
     """
     for batch in batches:
         times_s = seconds_of(batch[column], mapping.time, mapping.formats, log)
@@ -83,15 +83,16 @@ _SET_BACK_S = (1200.0, 7500.0)
 def _with_later_hours(
     batches: Iterator[pl.DataFrame], log: Path, mapping: Mapping
 ) -> Iterator[pl.DataFrame]:
-    """Yield rows with `LATER`, where the mapping names the zone of its timestamps."""
+    """Yield rows with `LATER`, if the mapping states the zone of its timestamps."""
     time, column = mapping.time, mapping.time.column
     if time.zone is None or column is None or time.date is not None:
         yield from batches
         return
-    local, before_s, is_later = time.model_copy(update={"zone": None}), np.nan, False
+    local_time, before_s, is_later = time.model_copy(update={"zone": None}), np.nan, False
     for batch in batches:
-        local_s = seconds_of(batch[column], local, mapping.formats, log).to_numpy()
+        local_s = seconds_of(batch[column], local_time, mapping.formats, log).to_numpy()
         steps_s = np.diff(local_s, prepend=before_s)
+        # A step back by about an hour begins the later hour, any other jump ends it.
         back = (steps_s <= -_SET_BACK_S[0]) & (steps_s >= -_SET_BACK_S[1])
         turns = np.where(back, 1, np.where(np.abs(steps_s) >= _SET_BACK_S[0], -1, 0))
         last = np.maximum.accumulate(np.where(turns != 0, np.arange(turns.size), -1))
@@ -105,15 +106,15 @@ def _with_later_hours(
 # others. The table is made in windows of time, so that few rows of each base are in memory.
 
 DISORDER = "\0disorder"
-"""Column with the fault of a row's time within its base, null if it is right."""
+"""Column with the fault of a row's time within its base, null if the time is valid."""
 HELD = "\0held "
-"""Prefix of a column's name: its last value at the row's time, of any base."""
+"""Prefix of a column's name: the column's last value before the row's time, from any base."""
 ROW = "\0row"
 """Column with the row's number among those of its base, from 1."""
-_RIGHT = "\0right"
-"""Column with the last right time of the base up to each row, by which rows are sorted."""
+_LATEST = "\0latest"
+"""Column with the latest valid time of the base up to each row, by which rows are sorted."""
 WINDOW_ROWS = 2**16
-"""A window has about this many rows of all bases together."""
+"""Approximate number of rows of a window, of all bases together."""
 
 
 def merge_bases(
@@ -127,9 +128,9 @@ def merge_bases(
     """Yield the rows of all bases, window by window in the order of time, with `BASE` as a number.
 
     Times are in s. A row whose time does not increase within its base has the reason in
-    `DISORDER`, and is sorted at the base's last right time. Every row gets the last value of the
-    `held` columns (conditions, names of drives), unless that is older than `split_gap_s`. A base
-    without columns of `signals` has no rows of its own. The rows of a single base are yielded
+    `DISORDER`, and is sorted at the latest valid time of the base. Every row gets the last value of
+    the `held` columns (conditions, names of drives), unless that is older than `split_gap_s`. Rows
+    of a base without columns of `signals` are dropped. The rows of a single base are yielded
     unchanged. With `log`, bases without a common time raise `InputError`.
     """
     opened = [_TimeBase(base, time, split_gap_s) for base in bases]
@@ -147,7 +148,7 @@ def merge_bases(
     base_of = {name: n for n, base in reversed([*enumerate(filled)]) for name in base.columns}
     with_signals = [n for n, base in enumerate(filled) if base.columns.keys() & set(signals)]
     number_of_rows = max(WINDOW_ROWS // max(len(filled), 1), 1)
-    streams = [base.judged(number, number_of_rows) for number, base in enumerate(filled)]
+    streams = [base.checked_rows(number, number_of_rows) for number, base in enumerate(filled)]
     waiting = [no_rows] * len(streams)
     last: dict[str, pl.DataFrame] = {}
     while True:
@@ -157,27 +158,26 @@ def merge_bases(
         ]
         if not any(rows.height for rows in waiting):
             break
-        until_s = min(rows[_RIGHT][-1] for rows in waiting if rows.height)
+        # Up to this time the rows of every base are in memory.
+        until_s = min(rows[_LATEST][-1] for rows in waiting if rows.height)
         counts = [
-            rows[_RIGHT].search_sorted(until_s, side="right") if rows.height else 0
+            rows[_LATEST].search_sorted(until_s, side="right") if rows.height else 0
             for rows in waiting
         ]
         pairs = list(zip(waiting, counts, strict=True))
         window = pl.concat([no_rows, *(rows.head(n) for rows, n in pairs)], how="diagonal")
         waiting = [rows.slice(n) for rows, n in pairs]
-        window = window.sort(_RIGHT, maintain_order=True)
+        window = window.sort(_LATEST, maintain_order=True)
         for name in held:
-            is_stated = (
-                pl.col(name).is_not_null()
-                & (pl.col(BASE) == base_of.get(name, -1))
-                & pl.col(DISORDER).is_null()
-                & pl.col(time).is_finite()
-            )
-            stated = window.filter(is_stated).select(_RIGHT, pl.col(name).alias(HELD + name))
-            values = pl.concat([last.get(name, stated.clear()), stated]).set_sorted(_RIGHT)
+            is_valid = pl.col(DISORDER).is_null() & pl.col(time).is_finite()
+            is_of_base = pl.col(BASE) == base_of.get(name, -1)
+            stated = window.filter(is_valid & is_of_base & pl.col(name).is_not_null())
+            values = stated.select(_LATEST, pl.col(name).alias(HELD + name))
+            # The last value of the window before comes first.
+            values = pl.concat([last.get(name, values.clear()), values]).set_sorted(_LATEST)
             last[name] = values.tail(1)
-            window = window.join_asof(values, on=_RIGHT, tolerance=split_gap_s)
-        yield window.drop(_RIGHT).filter(pl.col(BASE).is_in(with_signals))
+            window = window.join_asof(values, on=_LATEST, tolerance=split_gap_s)
+        yield window.drop(_LATEST).filter(pl.col(BASE).is_in(with_signals))
     if log is not None:
         _require_common_time([filled[number] for number in with_signals], log)
 
@@ -187,7 +187,7 @@ _MAX_APART_S = 60.0
 
 
 def _require_common_time(bases: Sequence["_TimeBase"], log: Path) -> None:
-    """Raise `InputError` if a base shares no time with another one: it has another clock."""
+    """Raise `InputError` if a base has no time in common with any other: its clock differs."""
     for base in bases:
         distances_s = [
             max(other.start_s - base.end_s, base.start_s - other.end_s)
@@ -208,7 +208,7 @@ def _no_common_time(bases: Sequence["_TimeBase"], log: Path) -> InputError:
 
 
 class _TimeBase:
-    """The rows of a time base. Its first batch gives the columns."""
+    """The rows of a time base. The first batch defines the columns."""
 
     def __init__(self, batches: Iterator[pl.DataFrame], time: str, split_gap_s: float) -> None:
         self._time, self._gap_s = time, split_gap_s
@@ -219,15 +219,15 @@ class _TimeBase:
         times_s = first[time].to_numpy() if self.has_rows else np.zeros(0)
         self.start_s = float(next(iter(times_s[np.isfinite(times_s)]), np.nan))
         self.end_s = -np.inf
-        """The last right time so far."""
+        """The latest valid time so far."""
         self.example = next((name for name in first.columns if name != time), "")
         self.batches = chain([first], batches)
 
-    def judged(self, number: int, count: int) -> Iterator[pl.DataFrame]:
-        """Yield at most `count` rows at once, with `BASE`, `ROW`, `DISORDER` and `_RIGHT`.
+    def checked_rows(self, number: int, count: int) -> Iterator[pl.DataFrame]:
+        """Yield at most `count` rows at once, with `BASE`, `ROW`, `DISORDER` and `_LATEST`.
 
-        A row far ahead of both neighbours is `isolated`, or all rows after it would be late. So the
-        last row of a batch waits for the next one.
+        A row far ahead of both neighbours is `isolated`; otherwise all rows after it would be late.
+        Therefore the last row of a batch waits for the next batch.
         """
         row, before_s = 0, np.nan
         waiting = pl.DataFrame(schema=self.columns)
@@ -243,19 +243,19 @@ class _TimeBase:
                 step_s = np.diff(time_s, prepend=before_s)
             ahead = (step_s > self._gap_s) & (next_s < time_s)
             usable = np.where(ahead | ~np.isfinite(time_s), -np.inf, time_s)
-            right_s = np.maximum.accumulate(np.append(self.end_s, usable))
+            latest_s = np.maximum.accumulate(np.append(self.end_s, usable))
             disorder = (
                 pl.when(pl.Series(ahead))
                 .then(pl.lit("isolated"))
-                .when(pl.Series(time_s < right_s[:-1]))
+                .when(pl.Series(time_s < latest_s[:-1]))
                 .then(pl.lit("time_backwards"))
-                .when(pl.Series(time_s == right_s[:-1]))
+                .when(pl.Series(time_s == latest_s[:-1]))
                 .then(pl.lit("time_duplicate"))
             )
             yield ready.with_columns(
                 disorder.alias(DISORDER),
                 pl.lit(number, pl.Int32).alias(BASE),
                 pl.int_range(row + 1, row + ready.height + 1, dtype=pl.Int64).alias(ROW),
-                pl.Series(_RIGHT, right_s[1:]),
+                pl.Series(_LATEST, latest_s[1:]),
             )
-            row, before_s, self.end_s = row + ready.height, time_s[-1], right_s[-1]
+            row, before_s, self.end_s = row + ready.height, time_s[-1], latest_s[-1]

@@ -1,7 +1,7 @@
-"""Checks each row by itself: values in SI units of good ones, the reason why bad ones are refused.
+"""Checks each row by itself: converts good rows to SI units, rejects bad rows with a reason.
 
-A batch's columns carry the prefix `RAW`, so that no name in a file can meet one of ours, be taken
-for a pattern, or be anything but a name.
+The columns of a batch have the prefix `RAW`, so that no name in a file equals one of ours or is a
+pattern of Polars.
 """
 
 import dataclasses
@@ -31,15 +31,15 @@ from fleet_slip.ingest.mapping import FromColumn, Mapping
 
 RAW = "raw "
 Faults: TypeAlias = dict[str, pl.Expr]
-"""Boolean expressions, true for rows with a fault, by reason. The first fault is reported."""
+"""Boolean expressions by reason, true for rows with this fault. The first fault is reported."""
 
 
 @dataclass(frozen=True)
 class RowField:
-    """A value to take from a row, or a condition on it.
+    """A value to read from a row, or a condition on the row.
 
-    `value` is made of raw columns; `faults` may also use the value under the field's name, so that
-    a text is parsed once.
+    `value` is computed from raw columns. `faults` may also use the value under the field's name, so
+    that a text is parsed once.
     """
 
     name: str
@@ -51,13 +51,13 @@ class RowField:
 
 @dataclass(frozen=True)
 class RawColumns:
-    """The raw columns of batches with one schema, read as a mapping states."""
+    """The raw columns of batches with one schema, and the mapping that defines their use."""
 
     schema: pl.Schema
     mapping: Mapping
 
     def held(self, column: str) -> str:
-        """Return the column with a column's last value, for rows of several time bases."""
+        """Return the name of a column; with several time bases, that of its last value."""
         return HELD + column if RAW + HELD + column in self.schema else column
 
     def kind(self, column: str) -> pl.DataType:
@@ -94,7 +94,7 @@ _FIRST_DAY, _END_DAY = date(1970, 1, 1), date(2200, 1, 1)
 
 
 def day_field(name: str, column: str, columns: RawColumns) -> RowField:
-    """Return the field of a day. Raises `ValueError` for a column that is none."""
+    """Return the field of a day. Raises `ValueError` for a column of another type."""
     raw, value = pl.col(RAW + column), pl.col(name)
     text = raw
     match columns.kind(column):
@@ -125,11 +125,11 @@ def time_field(column: str, columns: RawColumns) -> RowField:
     if column == OWN_TIME:
         return RowField("time", "time", raw, raw, faults)
     dates = None
-    if time.date is not None:  # dates of digits alone get the zeros that a number lacks
+    if time.date is not None:  # dates of digits only, read as numbers, lost leading zeros
         digits = _FIRST_DAY.strftime(time.date.format)
         dates = columns.text(columns.held(time.date.column))
         dates = dates.str.zfill(len(digits)) if digits.isdigit() else dates
-    time_s = time.in_s(
+    time_s = time.to_seconds(
         raw,
         columns.kind(column),
         missing=mapping.missing,
@@ -143,7 +143,7 @@ def time_field(column: str, columns: RawColumns) -> RowField:
 # The fields of a mapping: values in SI units and their problems.
 
 MAX_VALUE_CHARACTERS = 200
-"""Characters of offending values that are kept."""
+"""Maximum number of characters of a value in the quarantine."""
 
 
 def fields_of(columns: RawColumns) -> list[RowField]:
@@ -156,18 +156,18 @@ def fields_of(columns: RawColumns) -> list[RowField]:
         _METADATA[name](name, columns.held(column), columns)
         for name, column in _key_columns(mapping).items()
     ]
-    time = OWN_TIME if RAW + OWN_TIME in schema else mapping.time.key
+    time = OWN_TIME if RAW + OWN_TIME in schema else mapping.time.batch_column
     if time is not None:
         fields.append(time_field(time, columns))
         if RAW + DISORDER in schema:
-            # The faults of times within their base, found by `merge_bases`.
+            # `merge_bases` has found the faults of times within their base.
             reasons = ("time_backwards", "time_duplicate", "isolated")
             faults = {reason: pl.col(RAW + DISORDER) == reason for reason in reasons}
             fields.append(_condition(faults, raw=pl.col(RAW + time), name="time"))
     names = [name for name in mapping.signal_catalog.signals if name in mapping.signals]
     signals = [_signal(name, columns) for name in names]
-    nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
-    fields += [*signals, _condition({"no_value": nothing}, raw=pl.lit(None, pl.String))]
+    is_empty = pl.all_horizontal([pl.col(name).is_null() for name in names])
+    fields += [*signals, _condition({"no_value": is_empty}, raw=pl.lit(None, pl.String))]
     if RAW + EXTRA_FIELDS in schema:
         extra = pl.col(RAW + EXTRA_FIELDS)
         short = {"cut_line": extra == CUT, "fewer_fields": extra == FEWER}
@@ -188,7 +188,7 @@ def _condition(faults: Faults, raw: pl.Expr, name: str = "") -> RowField:
 
 
 def _signal(name: str, columns: RawColumns) -> RowField:
-    """Return a signal in SI units; its range is checked on the count that it becomes."""
+    """Return the field of a signal in SI units; the count after rounding must be in range."""
     mapping = columns.mapping
     source = mapping.signals[name]
     value = columns.number(source.column)
@@ -197,7 +197,7 @@ def _signal(name: str, columns: RawColumns) -> RowField:
         is_negative = sign == str(source.sign.negative)
         value = pl.when(is_negative).then(-value).when(sign.is_not_null()).then(value)
     gain, bias = source.linear(mapping.signal_catalog[name].unit)
-    if (gain, bias) != (1.0, 0.0):  # otherwise it would change nothing but the sign of zero
+    if (gain, bias) != (1.0, 0.0):  # an identity would change the sign of zero
         value = value * gain + bias
     signal, low, high = count_range(mapping.signal_catalog, name, source)
     scale = float(signal.scale)
@@ -217,7 +217,7 @@ def _text(name: str, column: str, columns: RawColumns) -> RowField:
     value = text.map_batches(partial(_map_texts, normalize_name), pl.String)
     faults_of_names = pl.col(name).map_batches(partial(_map_texts, find_name_fault), pl.String)
     faulty = faults_of_names.is_not_null()
-    if columns.kind(column) == pl.Float64:  # which has lost digits of longer numbers
+    if columns.kind(column) == pl.Float64:  # larger numbers have lost digits
         faulty |= pl.col(RAW + column).abs() >= MAX_WHOLE
     faults = {"missing": pl.col(name).is_null(), "out_of_range": faulty}
     return RowField(name, "key", pl.col(RAW + column), value, faults)
@@ -243,10 +243,10 @@ _METADATA: dict[str, Callable[[str, str, RawColumns], RowField]] = {
 }
 
 
-# Each row is checked by itself: values in SI units of good ones, the reason of bad ones.
+# Checks of rows.
 
 MAX_KEYS = 100_000
-"""Combinations of drive metadata in one file, of whatever rows."""
+"""Maximum number of combinations of drive metadata in one file."""
 
 
 @dataclass
@@ -275,14 +275,14 @@ class IngestCounts:
 def check_rows(
     file: Path, mapping: Mapping, keys: "DriveKeys", counts: IngestCounts
 ) -> Iterator[tuple[pl.DataFrame, pl.DataFrame]]:
-    """Yield the good rows of each batch, and the refused ones; count the rows that were read.
+    """Yield the good rows of each batch, and the rejected ones.
 
-    Raises `InputError`.
+    Adds new groups to `keys`, and the rows to `counts`. Raises `InputError`.
     """
     for batch in read_batches(file, mapping):
         raw = _without_nan(batch.rename({name: RAW + name for name in batch.columns}))
         try:
-            fields, meeting = _understand(mapping, tuple(raw.schema.items()))
+            fields, condition = _fields_and_condition(mapping, tuple(raw.schema.items()))
         except ValueError as error:
             raise InputError(f"{quote_name(file)}: {error}") from None
         if RAW + ROW in raw.columns:
@@ -291,11 +291,12 @@ def check_rows(
             first, end = counts.rows_read + 1, counts.rows_read + raw.height + 1
             raw = raw.with_columns(pl.int_range(first, end, dtype=pl.Int64).alias("row"))
         counts.rows_read += raw.height
-        if meeting is not None:
-            selected = raw.filter(meeting)
+        if condition is not None:
+            selected = raw.filter(condition)
             counts.rows_left_out += raw.height - selected.height
             raw = selected
-        rows, refused = _split(raw, keys.number(raw, fields), fields)
+        groups = keys.assign_groups(raw, fields)
+        rows, refused = _split(raw, groups, fields)
         if len(keys.metadata) > MAX_KEYS:
             raise InputError(
                 f"{quote_name(file)}: more than {MAX_KEYS:,} combinations of drive metadata. Check "
@@ -326,10 +327,13 @@ def _without_nan(batch: pl.DataFrame) -> pl.DataFrame:
 
 
 @lru_cache(maxsize=64)
-def _understand(
+def _fields_and_condition(
     mapping: Mapping, columns: tuple[tuple[str, pl.DataType], ...]
 ) -> tuple[list[RowField], pl.Expr | None]:
-    """Return the fields of batches with these columns: the same for all files of a folder."""
+    """Return the fields of batches with these columns, and the condition on rows of the mapping.
+
+    The files of a folder usually have the same columns, so that the cache saves time.
+    """
     raw = RawColumns(pl.Schema(columns), mapping)
     predicates = []
     for condition in mapping.where:
@@ -339,19 +343,19 @@ def _understand(
 
 
 class DriveKeys:
-    """Numbers the combinations of drive metadata in a file, from 0, in order of appearance."""
+    """Groups of rows with the same drive metadata, numbered from 0 in order of appearance."""
 
     def __init__(self) -> None:
-        """Begin without any."""
+        """Begin without groups."""
         self._numbers: dict[tuple[Any, ...], int] = {}
         self.metadata: list[dict[str, Any]] = []
-        """The metadata of each number."""
+        """The metadata of each group."""
 
-    def number(self, batch: pl.DataFrame, fields: list[RowField]) -> pl.Expr | pl.Series:
-        """Return `group` for raw columns: the row's number, null where its key is faulty.
+    def assign_groups(self, batch: pl.DataFrame, fields: list[RowField]) -> pl.Expr | pl.Series:
+        """Return the column `group` of a batch, null for faulty metadata; add new groups.
 
-        A key are the fields of the kind `key`; without any, the whole file is number 0. A run of
-        rows with the same raw values is looked at once.
+        The fields of the kind `key` contain the metadata. Without such fields all rows are group 0.
+        Only the first of consecutive rows with the same raw values is examined.
         """
         keys = [field for field in fields if field.kind == "key"]
         if not keys:
@@ -379,13 +383,13 @@ class DriveKeys:
 
 
 LARGE_FILE_BYTES = 2**22
-"""Size of a file from which `is_grouped` reads it: the rows of a smaller one fit into memory."""
+"""Minimum size of a file that `is_grouped` reads: the rows of smaller files fit into memory."""
 
 
 def is_grouped(file: Path, mapping: Mapping) -> bool:
-    """Return True if the rows of each drive are together. Reads these columns only.
+    """Return True if the rows of each group are together. Reads only the columns of metadata.
 
-    False for small files, several time bases, and a file whose faults `check_rows` reports.
+    Returns False for small files, several time bases, and a file that `check_rows` refuses.
     """
     columns = _key_columns(mapping)
     if not columns:
@@ -399,7 +403,7 @@ def is_grouped(file: Path, mapping: Mapping) -> bool:
             raw = batch.rename({name: RAW + name for name in batch.columns})
             of_batch = RawColumns(raw.schema, mapping)
             fields = [_METADATA[name](name, column, of_batch) for name, column in columns.items()]
-            groups = raw.select(keys.number(raw, fields))["group"].drop_nulls()
+            groups = raw.select(keys.assign_groups(raw, fields))["group"].drop_nulls()
             if not groups.is_sorted() or (len(groups) and groups[0] < latest):
                 return False
             latest = groups[-1] if len(groups) else latest
@@ -416,10 +420,10 @@ def _values(fields: Iterable[RowField]) -> list[pl.Expr]:
 def _split(
     raw: pl.DataFrame, group: pl.Expr | pl.Series, fields: list[RowField]
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Split a batch into good rows, in SI units, and bad ones with the first fault of each.
+    """Split a batch into good rows, in SI units, and rejected ones with the first fault of each.
 
-    Most batches are good: then each fault is only looked for. A signal that is no finite number is
-    out of its range, too.
+    Most batches have no fault, so one query first tests if any fault occurs. It tests only the
+    range of signals, since NaN and infinity are out of range, too.
     """
     measured = [field for field in fields if field.kind in {"time", "signal"}]
     columns = ["row", "group", *({"base"} & set(raw.columns)), *(f.name for f in measured)]
@@ -443,15 +447,15 @@ def _split(
     for (source, reason, _), mask in zip(faults, masks, strict=True):
         if mask.any():
             bad = valued.filter(mask & ~is_refused)
-            pieces.append(describe_refused(bad, reason, source.name or None, source.raw))
+            pieces.append(describe_rejected(bad, reason, source.name or None, source.raw))
             is_refused |= mask
     return valued.filter(~is_refused).select(columns), pl.concat(pieces)
 
 
-def describe_refused(
+def describe_rejected(
     rows: pl.DataFrame, reason: str, signal: str | None = "time", value: pl.Expr | None = None
 ) -> pl.DataFrame:
-    """Return rows as bad ones, by default because of their time."""
+    """Return rejected rows with a reason, a signal and its value; by default those of the time."""
     text = (pl.col("time") if value is None else value).cast(pl.String)
     return rows.select(
         "row",
@@ -464,6 +468,6 @@ def describe_refused(
 
 @cache
 def no_rows() -> pl.DataFrame:
-    """Return an empty frame of bad rows."""
+    """Return an empty frame of rejected rows."""
     names = {"row": pl.Int64, "group": pl.Int32, "reason": pl.String}
     return pl.DataFrame(schema={**names, "signal": pl.String, "value": pl.String})

@@ -89,8 +89,8 @@ def measures(unit: str, si_unit: str) -> bool:
     return False
 
 
-NO_NUMBER = r"(?i)^[+-]?(nan|1\.#(qnan|snan|ind))\b"
-"""How programs write NaN, which is a missing value."""
+NAN_TEXT = r"(?i)^[+-]?(nan|1\.#(qnan|snan|ind))\b"
+"""Pattern of texts by which programs write NaN, a missing value."""
 _GROUPED = r"^[+-]?[1-9]\d{0,2}(\.\d{3})+(,\d*)?$"
 
 
@@ -116,7 +116,7 @@ def is_number(text: str) -> bool:
 
 
 def without_missing(text: pl.Expr, missing: Sequence[str]) -> pl.Expr:
-    """Return a text without spaces around it, null where it means that there is no value."""
+    """Return a text without spaces around it; null for texts that mark a missing value."""
     text = text.str.strip_chars()
     return pl.when(~text.is_in(["", *missing])).then(text)
 
@@ -131,7 +131,7 @@ def as_number(
     if kind == pl.String:
         text = without_missing(raw, missing)
         number = parse_numbers(text, decimal_comma=decimal_comma)
-        is_missing = text.is_null() | number.is_nan() | text.str.contains(NO_NUMBER)
+        is_missing = text.is_null() | number.is_nan() | text.str.contains(NAN_TEXT)
         number = pl.when(~is_missing.fill_null(value=False)).then(number.fill_null(float("nan")))
     elif kind.is_numeric():
         number = raw.cast(pl.Float64)
@@ -189,18 +189,18 @@ class SignalColumn(Config):
     interpolate: bool = added(True)
     """False: samples are moved to the nearest tick, and ticks between them have no value."""
     longest_gap_s: Annotated[FiniteFloat, Field(gt=0, le=10)] | None = added(None)
-    """Instead of the mapping's, for a signal with a rate of its own."""
+    """Replaces the mapping's `longest_gap_s` for a signal with another rate."""
     time: Name | None = added(None)
-    """The column of this signal's times, where the file has several, in the unit of the others."""
+    """Column of this signal's times if the file has several, in the unit of `[time]`."""
 
     component: Component | None = added(None)
     """Component of the velocity over ground, for `course = { north = …, east = … }`."""
     clockwise_from_north: bool | None = added(None)
     """True if the course is clockwise from north, False if counterclockwise from east."""
     antenna_x_m: OffsetM | None = added(None)
-    """How far the receiver's antenna is before the centre of gravity."""
+    """Distance of the receiver's antenna before the centre of gravity, in m."""
     antenna_y_m: OffsetM | None = added(None)
-    """How far it is to the left of the centre of gravity."""
+    """Distance of the antenna to the left of the centre of gravity, in m."""
 
     @field_validator("unit")
     @classmethod
@@ -256,8 +256,8 @@ def split_components(signals: Any) -> Any:
     }
 
 
-def require_satellites(signals: Named[str, SignalColumn]) -> None:
-    """Raise `ValueError` unless the course, if there is one, comes with all that it needs."""
+def require_course_columns(signals: Named[str, SignalColumn]) -> None:
+    """Raise `ValueError` if a key or a column that a course needs is missing."""
     for name, signal in signals.items():
         keys = (
             signal.clockwise_from_north,
@@ -290,7 +290,11 @@ def require_satellites(signals: Named[str, SignalColumn]) -> None:
 
 
 def count_range(signals: SignalCatalog, name: str, column: SignalColumn) -> tuple[Signal, int, int]:
-    """Return the signal as which a column is checked, a course in any turn, and its counts."""
+    """Return the signal whose scale a column has, and its smallest and largest valid count.
+
+    A velocity component has the scale of the satellite speed, and either sign. A course may be
+    given in any turn from -2 to 2.
+    """
     if column.component:
         speed = signals[SATELLITE_SPEED]
         return speed, -speed.max_count, speed.max_count
@@ -310,10 +314,13 @@ class DateColumn(Config):
 class TimeBase(Config):
     """The source of time, and the gaps that are interpolated or end a drive.
 
-    Either `column` with a `unit` (numbers) or a `format` (timestamps as text, strftime codes; naive
-    ones are UTC, or of a `zone`; a Parquet timestamp column needs no format; a `date` may be a
-    separate column), or `rate_hz` for equally spaced rows, or `own_clock` for a format that stores
-    the times of samples.
+    One of three keys states it:
+
+    * `column`, with a `unit` for numbers, or a `format` (strftime codes) for timestamps as text.
+      Timestamps without a zone are UTC, or of the `zone`. A `date` may be a separate column. A
+      timestamp column of Parquet needs no format.
+    * `rate_hz`, for equally spaced rows.
+    * `own_clock`, for a format that stores the times of samples.
     """
 
     column: Name | None = None
@@ -390,7 +397,7 @@ class TimeBase(Config):
         """The format of a text, preceded by the date if that is a separate column."""
         return self.format if self.date is None else f"{self.date.format} {self.format}"
 
-    def in_s(
+    def to_seconds(
         self,
         raw: pl.Expr,
         kind: pl.DataType,
@@ -402,8 +409,8 @@ class TimeBase(Config):
     ) -> pl.Expr:
         """Return times in s, since 1970 if they have a date.
 
-        Null for a missing time, NaN for a text that is none. `dates` are those of a column of their
-        own; for `later` see `in_utc`. Raises `ValueError` for a column of another type.
+        Null for a missing time, NaN for other texts. `dates` is a separate column of dates; for
+        `later` see `to_utc`. Raises `ValueError` for a column of another type.
         """
         if self.unit is not None:
             number = as_number(str(self.column), raw, kind, missing, decimal_comma=decimal_comma)
@@ -419,13 +426,13 @@ class TimeBase(Config):
         elif not isinstance(kind, pl.Datetime):
             needed = "a time: add 'unit' for numbers, 'format' for timestamps as text"
             raise unfit_column(self.column, kind, needed)
-        time_s = self.in_utc(moment, kind, later).dt.epoch("us") / 1e6
+        time_s = self.to_utc(moment, kind, later).dt.epoch("us") / 1e6
         return time_s.fill_null(pl.when(text.is_not_null()).then(float("nan")))
 
-    def in_utc(self, moment: pl.Expr, kind: pl.DataType, later: pl.Expr | None = None) -> pl.Expr:
+    def to_utc(self, moment: pl.Expr, kind: pl.DataType, later: pl.Expr | None = None) -> pl.Expr:
         """Return timestamps without a zone as those of `zone`.
 
-        Of an hour that comes twice, when clocks are set back, it is the second where `later`.
+        An hour occurs twice when clocks are set back: `later` is true in the second one.
         """
         if self.zone is None or getattr(kind, "time_zone", None) is not None:
             return moment
@@ -434,8 +441,8 @@ class TimeBase(Config):
         return moment.dt.replace_time_zone(self.zone, ambiguous=ambiguous, non_existent="null")
 
     @property
-    def key(self) -> str | None:
-        """The column that has the times of a batch, None if the rows are equally spaced."""
+    def batch_column(self) -> str | None:
+        """The column of a batch that contains the times, None if rows are equally spaced."""
         return OWN_TIME if self.own_clock else self.column
 
 
@@ -508,7 +515,7 @@ class RowCondition(Config):
     below: Bound | None = added(None)
     other_than: Bound | None = added(None)
     one_of: tuple[Name, ...] = ()
-    """Texts, such as the states of a fix; of a column of numbers, numbers as text."""
+    """Allowed texts, such as states of a fix. For a column of numbers: the numbers as text."""
 
     @model_validator(mode="after")
     def _says_something(self) -> "RowCondition":
@@ -523,7 +530,7 @@ class RowCondition(Config):
         return {key: bound for key, bound in bounds.items() if bound is not None}
 
     def is_met(self, value: pl.Expr) -> pl.Expr:
-        """Return whether a row meets it, given a text where it is one of some, else a number."""
+        """Return where rows meet the condition; `value` is text for `one_of`, else a number."""
         if self.one_of:
             return value.is_in(self.one_of).fill_null(value=False)
         met = (_BOUNDS[key](value, bound) for key, bound in self.bounds.items())

@@ -48,7 +48,7 @@ class Draft:
     drive: dict[str, dict[str, str]]
     """The columns that identify cars and trips, by key of `[drive]`."""
     absent: tuple[str, ...]
-    """The signals that no channel looks like."""
+    """The signals without a channel."""
     notes: tuple[str, ...]
     """Questions that only a person can answer, and parts of the file that were not read."""
 
@@ -74,7 +74,7 @@ def draft_mapping(signals: SignalCatalog, file: Path, profile: FileProfile) -> D
             f"mapping by hand: docs/mapping.md. {' '.join(_refused(profile))}".rstrip()
         )
     drive_keys, group = guess_cars(profile.profiles)
-    if isinstance(file, FileGroup):  # of a lake
+    if isinstance(file, FileGroup):  # the files of a lake are in a folder for each car
         drive_keys["vehicle_id"] = {"path": "{}/*"}
     bases = [guess.profile.channel.base for guess in guesses.values()]
     time = guess_time(profile, {guess.column for guess in guesses.values()}, bases, group)
@@ -131,11 +131,11 @@ def _refused(profile: FileProfile) -> Iterator[str]:
 # Writes a draft of a mapping as TOML, each guess with its reasons as a comment.
 
 _COLUMNS = 80
-"""Width of a terminal, which breaks longer lines, so that a copy is not valid TOML."""
+"""Width of a terminal: it breaks longer lines, and a copy would not be valid TOML."""
 
 
 def name_of(stem: str) -> str:
-    """Return the name of a mapping for a file, whatever that is called, such as 2024-05-30."""
+    """Return a valid name of a mapping for a file, also for names such as 2024-05-30."""
     plain = re.sub("[^a-z0-9]", "_", stem.lower())
     return (plain if plain[:1].isalpha() else f"log_{plain}")[:41]
 

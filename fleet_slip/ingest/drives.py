@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.ingest.checked_columns import describe_refused
+from fleet_slip.ingest.checked_columns import describe_rejected
 from fleet_slip.ingest.columns import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.formats.source import Spool
 
@@ -24,7 +24,7 @@ MAX_DRIVE_ROWS = 2**19
 class DriveSamples:
     """The rows of one drive by time base, in chunks that are not copied together.
 
-    Each of several bases has the signals with values in it.
+    With several bases, each has only the signals with values in it.
     """
 
     group: int
@@ -47,7 +47,7 @@ class DriveSamples:
 
     @cached_property
     def intervals_s(self) -> dict[int, float]:
-        """The median time between two rows of each base; that of a tick for a single row."""
+        """The median time between two rows of each base; one tick for a single row."""
         steps_s = {base: np.diff(rows["time"].to_numpy()) for base, rows in self.bases.items()}
         return {
             b: float(np.median(steps)) if steps.size else STEP_S for b, steps in steps_s.items()
@@ -80,9 +80,9 @@ class DriveCutter:
     """Cuts the rows of one group after another, such as cars, and rejects rows out of order.
 
     A step in time larger than `split_gap_s`, forward or back, begins a drive. A row that far from
-    both neighbours is `isolated`, so that one wrong time stamp does not cut a drive.
-    `time_duplicate` and `time_backwards` are rows not later than all rows since the last such step.
-    The result does not depend on the blocks: a row that needs the next one waits for it.
+    both neighbours is `isolated`, so that one wrong time stamp does not cut a drive. Rows that are
+    not later than all rows of the drive are `time_duplicate` or `time_backwards`. The result does
+    not depend on the blocks: a row whose next row is in another block waits for it.
     """
 
     def __init__(self, split_gap_s: float, reject: Callable[[pl.DataFrame], None]) -> None:
@@ -96,9 +96,12 @@ class DriveCutter:
         self._pieces: dict[int, list[pl.DataFrame]] = defaultdict(list)
         """Rows of the open drive by time base."""
         self._rows_by_base: dict[int, int] = defaultdict(int)
-        self._start_s = self._last_s = self._latest_s = np.nan
-        self._last_placed_s = np.nan
-        """Time of the last row that is not isolated; `_last_s` is that of any row."""
+        self._start_s = np.nan
+        """Time of the first row of the open drive."""
+        self._latest_s = np.nan
+        """Latest time of a row since the last step in time."""
+        self._last_s = self._last_placed_s = np.nan
+        """Times of the last row, and of the last row that is not isolated."""
 
     def cut(self, rows: pl.DataFrame) -> Iterator[DriveSamples]:
         """Yield the drives that end in a block, in which the rows of each group are together."""
@@ -115,7 +118,7 @@ class DriveCutter:
     def end_group(self) -> Iterator[DriveSamples]:
         """Yield the open drive, after the last row of a group."""
         if self._waiting is not None:
-            self._reject(describe_refused(self._waiting, "isolated"))
+            self._reject(describe_rejected(self._waiting, "isolated"))
         yield from self._end_drive()
 
     def _continue_group(self, rows: pl.DataFrame) -> Iterator[DriveSamples]:
@@ -130,7 +133,7 @@ class DriveCutter:
         if rows.is_empty():
             return
         self._last_s = time_s[-1]
-        rows = self._without(rows, is_isolated, "isolated")
+        rows = self._reject_rows(rows, is_isolated, "isolated")
         time_s = rows["time"].to_numpy()
         if not time_s.size:
             return
@@ -144,16 +147,16 @@ class DriveCutter:
             yield from self._continue_drive(rows.slice(start, end - start))
 
     def _is_far(self, time_s: np.ndarray, before_s: float) -> BoolArray:
-        """Return which rows are far from the one before; the first row of all is."""
+        """Return a mask of rows far from the row before; without a row before it is True."""
         is_far: BoolArray = ~(np.abs(np.diff(time_s, prepend=before_s)) <= self._gap_s)
         return is_far
 
-    def _without(self, rows: pl.DataFrame, is_refused: BoolArray, reason: str) -> pl.DataFrame:
-        """Reject the rows of a mask; return the others."""
+    def _reject_rows(self, rows: pl.DataFrame, is_refused: BoolArray, reason: str) -> pl.DataFrame:
+        """Reject the rows of a mask; return the remaining rows."""
         if not is_refused.any():
             return rows
         mask = pl.Series(is_refused)
-        self._reject(describe_refused(rows.filter(mask), reason))
+        self._reject(describe_rejected(rows.filter(mask), reason))
         return rows.filter(~mask)
 
     def _continue_drive(self, rows: pl.DataFrame) -> Iterator[DriveSamples]:
@@ -163,23 +166,23 @@ class DriveCutter:
             latest_s = np.fmax.accumulate(np.append(self._latest_s, time_s))
             self._latest_s = latest_s[-1]
             is_backwards, is_twice = time_s < latest_s[:-1], time_s == latest_s[:-1]
-            rows = self._without(rows, is_backwards, "time_backwards")
-            rows = self._without(rows, is_twice[~is_backwards], "time_duplicate")
+            rows = self._reject_rows(rows, is_backwards, "time_backwards")
+            rows = self._reject_rows(rows, is_twice[~is_backwards], "time_duplicate")
         while rows.height:
-            number = self._fitting_rows(rows)
+            if not self._pieces:
+                self._start_s = rows["time"][0]
+            number = self._count_fitting(rows)
             if number:
                 self._add(rows.head(number))
             rows = rows.slice(number)
             if rows.height:
                 yield from self._end_drive()
 
-    def _fitting_rows(self, rows: pl.DataFrame) -> int:
-        """Return how many of some rows are part of the open drive; of a new one the first is."""
-        begins = not self._pieces
-        if begins:
-            self._start_s = rows["time"][0]
+    def _count_fitting(self, rows: pl.DataFrame) -> int:
+        """Return the number of rows that fit into the open drive; a new drive fits at least one."""
         time_s = rows["time"].to_numpy()
-        fitting = max(int(np.searchsorted(time_s, self._start_s + MAX_DRIVE_S)), begins)
+        fitting = int(np.searchsorted(time_s, self._start_s + MAX_DRIVE_S))
+        fitting = fitting if self._pieces else max(fitting, 1)
         if "base" not in rows.columns:
             return min(fitting, MAX_DRIVE_ROWS - self._rows_by_base[0])
         number = rows.select(pl.int_range(pl.len()).over("base")).to_series()
@@ -188,7 +191,7 @@ class DriveCutter:
         return int(beyond[0]) if len(beyond) and beyond[0] < fitting else fitting
 
     def _add(self, rows: pl.DataFrame) -> None:
-        """Add rows to the open drive, those of each base without its empty columns."""
+        """Add rows to the open drive, by time base and without the columns that are empty there."""
         several = "base" in rows.columns
         pieces = rows.partition_by("base", as_dict=True) if several else {(0,): rows}
         for (base,), piece in pieces.items():
@@ -207,9 +210,9 @@ class DriveCutter:
 # The rows of drives that alternate, such as those of several cars, are sorted first.
 
 MAX_VALUES_IN_MEMORY = 2**22
-"""Values in memory, 32 MiB; those of other rows are in a temporary file."""
+"""Maximum number of values in memory, 32 MiB; other rows are in a temporary file."""
 BLOCK_BYTES = 2**23
-"""Bytes of a group that are read at once."""
+"""Number of bytes of a group to read at once."""
 
 
 def sort_by_group(blocks: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
@@ -231,10 +234,10 @@ def sort_by_group(blocks: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
         for piece in spool.read(group):
             content += piece
             if len(content) > BLOCK_BYTES:
-                yield _rows_of(content, rows.schema)
+                yield _decode_rows(content, rows.schema)
                 content = bytearray()
         if content:
-            yield _rows_of(content, rows.schema)
+            yield _decode_rows(content, rows.schema)
 
 
 def _spill(rows: pl.DataFrame, spool: Spool) -> set[int]:
@@ -248,6 +251,6 @@ def _spill(rows: pl.DataFrame, spool: Spool) -> set[int]:
     return set(groups)
 
 
-def _rows_of(content: bytearray, schema: pl.Schema) -> pl.DataFrame:
+def _decode_rows(content: bytearray, schema: pl.Schema) -> pl.DataFrame:
     values = np.frombuffer(content).reshape(-1, len(schema))
     return pl.DataFrame(values, schema.names()).fill_nan(None).cast(schema)

@@ -47,18 +47,18 @@ Keys: TypeAlias = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Guess:
-    """A channel as a signal.
+    """A channel that may be a signal.
 
     Attributes
     ----------
     keys
-        Of the signal in a mapping, without the column: unit, negate, sign …
+        Keys of the signal in a mapping, without the column: unit, negate, sign …
     reasons
-        Texts for people.
+        Reasons for the guess, as texts.
     doubts
-        Reasons against it.
+        Reasons against the guess.
     rivals
-        Other signals that its name and unit fit.
+        Guesses of other channels that fit the signal equally well.
     readings
         The possible units, if the file has none.
     """
@@ -78,7 +78,7 @@ class Guess:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """The signal in a mapping, with the keys that are not usual."""
+        """The entry of the signal in a mapping, without keys at their default."""
         column = {} if "north" in self.keys else {"column": self.column}
         rate_hz, entry = self.profile.rate_hz, {**column, **self.keys}
         if rate_hz and rate_hz < 20 and self.signal not in {COURSE, SATELLITE_SPEED}:
@@ -87,7 +87,7 @@ class Guess:
 
     @property
     def is_doubtful(self) -> bool:
-        """True if something speaks against it, or for others too."""
+        """True if the guess has doubts or rivals."""
         return bool(self.doubts or self.rivals)
 
     @property
@@ -102,7 +102,7 @@ class Guess:
     def choices(self) -> str:
         """The units that are possible, as a person writes them."""
         units = [f'"{keys["unit"]}"' for keys in self.readings]
-        if "radius_m" in self.readings[0]:  # as every velocity of a wheel
+        if "radius_m" in self.readings[0]:  # a wheel speed in km/h or m/s
             units[0] += f" with radius_m = {RADIUS_M}"
         return " or ".join(units)
 
@@ -118,7 +118,7 @@ class Guess:
         return replace(self, keys={**self.keys, **keys}, reasons=(*self.reasons, reason))
 
     def doubted(self, doubt: str) -> "Guess":
-        """Return the guess as one that has something against it."""
+        """Return the guess with one more doubt."""
         return replace(self, doubts=(*self.doubts, doubt))
 
 
@@ -163,7 +163,7 @@ def _scored(catalog: SignalCatalog, profile: Profile) -> Iterator[tuple[float, G
 
 
 def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
-    """Return the guesses with the course as a mapping has it, or without it."""
+    """Return the guesses with the course in the form of mappings; without one if incomplete."""
     result = dict(guesses)
     north, east = result.pop("north", None), result.pop("east", None)
     course, speed = result.get(COURSE), result.get(SATELLITE_SPEED)
@@ -183,7 +183,7 @@ def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
 
 
 def _with_sign(guess: Guess, profiles: tuple[Profile, ...]) -> Guess:
-    """Return a magnitude with the column of its sign, where another is called so."""
+    """Return the guess of a magnitude with the column of its sign, if a channel is named so."""
     if guess.signal not in (*SIGNED, "sideslip") or guess.profile.range[0] < 0:
         return guess
     words_of_name = sorted(parts_of(split_unit(guess.column)[0]))
@@ -202,7 +202,7 @@ def _with_sign(guess: Guess, profiles: tuple[Profile, ...]) -> Guess:
 
 
 def headings(profiles: tuple[Profile, ...], taken: set[str]) -> list[tuple[str, str]]:
-    """Return the channels that are a heading or a course, whichever, and their units."""
+    """Return the channels that may be a heading or a course, and their units."""
     never = set(vocabulary()["never"]["course"])
     return [
         (p.channel.name, _unit_of(p) or CHOOSE)
@@ -292,7 +292,7 @@ class TimeGuess:
 
 
 def guess_cars(profiles: Iterable[Profile]) -> tuple[dict[str, dict[str, str]], NDArray[np.int64]]:
-    """Return the columns of cars and trips by key of `[drive]`, and a number for each row's."""
+    """Return the columns of cars and trips by key of `[drive]`, and a group number for each row."""
     keys: dict[str, dict[str, str]] = {}
     group = np.zeros(0, dtype=np.int64)
     for key, words in vocabulary()["cars"].items():
@@ -311,7 +311,7 @@ def guess_cars(profiles: Iterable[Profile]) -> tuple[dict[str, dict[str, str]], 
 def guess_time(
     profile: FileProfile, taken: set[str], bases: list[str], group: NDArray[np.int64]
 ) -> TimeGuess:
-    """Return where time is from; of several cars in turns, that of the first is looked at."""
+    """Return the source of time; if rows of cars alternate, only the first car is examined."""
     if profile.has_clock:
         return TimeGuess({"own_clock": True}, "the file says when each sample was taken", None)
     candidates = [
@@ -356,10 +356,10 @@ def _time_candidates(
 def guess_rasters(
     profile: FileProfile, time: TimeGuess, guesses: Mapping[str, Guess], group: NDArray[np.int64]
 ) -> dict[str, str]:
-    """Return the column of times of each column that has another than the file's.
+    """Return the column of times of each column whose times are not the file's.
 
-    In a text file it is the last one before the column, in others one of as many rows. A second
-    clock of the same rows is none.
+    In a text file it is the last column of times before the column, in other formats one with as
+    many rows. A second clock of the same rows does not count.
     """
     if profile.has_clock or "column" not in time.keys:
         return {}
@@ -390,7 +390,7 @@ def guess_rasters(
 
 
 def _is_raster(values: FloatArray, main: FloatArray) -> bool:
-    """Return True if times belong to other samples: in another number, or shifted by a step."""
+    """Return True if times belong to other samples: their number differs, or they are shifted."""
     step, main_step = np.median(np.diff(values)), np.median(np.diff(main))
     if values.size != main.size:
         return bool(step <= 1e4 * main_step)

@@ -35,10 +35,10 @@ WILDCARDS = frozenset("*?[")
 
 
 class LogFiles(list[Path]):
-    """Logs, and the other files of their folders whose suffix is not that of a log."""
+    """Logs, and in `passed_over` the files of their folders without the suffix of a log."""
 
     def __init__(self, logs: Iterable[Path], passed_over: Iterable[Path]) -> None:
-        """Take both."""
+        """Take the logs and the files that are passed over."""
         super().__init__(logs)
         self.passed_over = tuple(passed_over)
 
@@ -140,7 +140,7 @@ def _matching(pattern: Path) -> list[Path]:
 
 
 def _without_strays(files: list[Path], folder: Path) -> list[Path]:
-    """Return files that were found below a folder, marked where they are in truth elsewhere."""
+    """Return the files below a folder; those behind links out of it as `StrayLink`."""
     top = os.path.realpath(folder)
     return [file if _is_inside(file, top) else StrayLink(file) for file in files]
 
@@ -169,7 +169,7 @@ def _logs_below(folder: Path, passed_over: list[Path]) -> Iterator[Path]:
 def _begins_as_log(file: Path) -> bool:
     """Return True if the first bytes of a file are those of a log."""
     with suppress(OSError):
-        if file.is_file():  # a pipe would be waited for
+        if file.is_file():  # opening a pipe would wait
             with file.open("rb") as stream:
                 return stream.read(max(map(len, BEGINNINGS))).startswith(BEGINNINGS)
     return False
@@ -231,7 +231,7 @@ class FileGroup(PosixPath):
         return all(file.is_file() for file in self.files)
 
     def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
-        """Return the size of all files together, and the time of the last change."""
+        """Return the total size of all files, and the time of the last change."""
         states = [file.stat(follow_symlinks=follow_symlinks) for file in self.files]
         latest = max(states, key=lambda state: state.st_mtime_ns)
         size = sum(state.st_size for state in states)
@@ -242,14 +242,15 @@ class FileGroup(PosixPath):
 def group_lake(files: Iterable[Path]) -> list[Path]:
     """Return logs with the files of a lake as a group for each device and session.
 
-    A session goes on over midnight; where its number comes again later, it is another one.
+    A session may continue over midnight. The same number later, or with a smaller split, is a new
+    session.
     """
     files_alone: list[Path] = []
     sessions = defaultdict[Path, list[tuple[date, int, str, Path]]](list)
     for file in files:
         match = _LAKE.fullmatch(file.as_posix())
         day = None
-        with suppress(ValueError):  # of a day that does not exist
+        with suppress(ValueError):  # a day that does not exist
             day = datetime.strptime(match[4], "%Y/%m/%d").date() if match else None
         if match is None or day is None:
             files_alone.append(file)
@@ -280,7 +281,7 @@ def seconds_of(column: pl.Series, time: TimeBase, formats: FileFormats, log: Pat
     """Return times in s, NaN for other texts. Raises `InputError` for another type."""
     comma = formats.csv.decimal_comma
     try:
-        seconds = time.in_s(pl.col(column.name), column.dtype, decimal_comma=comma)
+        seconds = time.to_seconds(pl.col(column.name), column.dtype, decimal_comma=comma)
     except ValueError as error:
         raise InputError(f"{quote_name(log)}: {error}") from None
     return column.to_frame().select(seconds)[column.name]
@@ -292,7 +293,7 @@ class GroupSource(Source):
     has_clock = True
 
     def __init__(self, group: FileGroup, formats: FileFormats, times: Named[str, TimeBase]) -> None:
-        """Take the files, how they are written, and where the times of members are."""
+        """Take the files, their formats, and the columns of times by member."""
         self._group, self._times = group, times
         self._formats = replace(formats, plain_numbers=PlainNumbers())
         self._channels: dict[str, list[Channel]] = {}

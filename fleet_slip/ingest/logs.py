@@ -30,20 +30,20 @@ from fleet_slip.ingest.log_files import size_of
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_log import MeasuredLog, open_measured
 from fleet_slip.ingest.recordings import (
-    FILES,
+    FILE_PREFIX,
     Fingerprints,
     IngestCache,
     Replace,
     SourceRef,
     TableName,
-    digest_of,
-    drives_of,
+    combine_digests,
     drop_erased_drives,
     drop_erased_rejects,
     file_transaction,
     find_duplicates,
     fingerprints_of,
     readmit_file,
+    stored_drives,
     tables_of,
 )
 from fleet_slip.ingest.ticks import MeasuredDrive, drive_id
@@ -65,7 +65,7 @@ class IngestTask(NamedTuple):
     """A file to ingest, and the digest of the content that its path had when last ingested."""
 
     file: Path
-    earlier: str | None = None
+    previous_digest: str | None = None
 
 
 Batch: TypeAlias = tuple[IngestTask, ...]
@@ -83,7 +83,7 @@ class IngestReport(Record):
     file: str
     counts: IngestCounts
     suspicions: tuple[Fault, ...] = ()
-    """Faults of the file; and of the longest drive, in the report of one file of a batch."""
+    """Faults of the file, and of its longest drive unless another file of the batch has them."""
     new: bool = True
     drives_forgotten: int = 0
     """Drives that were skipped because they, or their cars, were erased."""
@@ -146,7 +146,8 @@ class Preview(IngestReport, Answer):
 class WrittenFile:
     """A file of a batch after writing.
 
-    `same` are the stored sources with its fingerprints, `replaced` those that it replaces.
+    `fingerprints` are those of the file and its drives, with the number of their `SourceRef`;
+    `stored_sources` have one of them, and `replaced` are the sources that the file replaces.
     """
 
     log: Path
@@ -154,20 +155,21 @@ class WrittenFile:
     report: IngestReport
     longest: MeasuredDrive | None = None
     fingerprints: dict[str, int] = field(default_factory=dict)
-    same: frozenset[SourceRef] = frozenset()
+    stored_sources: frozenset[SourceRef] = frozenset()
     replaced: frozenset[SourceRef] = frozenset()
 
 
 @dataclass(frozen=True)
 class WrittenBatch:
-    """A batch after writing; `forgotten` are the entries of the erasure log that it respects.
+    """A batch after writing.
 
-    `added` are its uncommitted data files, and `digests` the logs with rows in these, by table.
+    `erasures` are the entries of the erasure log that it respects. `added` are its uncommitted data
+    files, and `digests` the logs with rows in these, by table.
     """
 
     files: tuple[WrittenFile, ...]
     failures: tuple[Failure, ...]
-    forgotten: frozenset[int]
+    erasures: frozenset[int]
     added: dict[TableName, list[AddAction]]
     digests: dict[TableName, list[str]]
 
@@ -201,10 +203,10 @@ def ingest_files(
     warehouse.logs.require_writable(mapping.signal_names)
     failures: list[Failure] = []
     stored = 0
-    tasks = (IngestTask(file, cache.digest_of(file) if cache else None) for file in files)
-    for batch, written in _written(executor, write, _batches(tasks)):
+    tasks = (IngestTask(file, cache.previous_digest(file) if cache else None) for file in files)
+    for batch, written in _write_batches(executor, write, _batches(tasks)):
         # Not the file's name: it may contain a car's name, and the Delta log outlives erasures.
-        digest = digest_of([file.digest for file in written.files])
+        digest = combine_digests([file.digest for file in written.files])
         note = {"job": "ingest", "mapping": mapping.name, "digest": digest}
         committed, new = commit_batch(
             warehouse, written, partial(write, batch), note, build_removal
@@ -212,26 +214,26 @@ def ingest_files(
         failures += committed.failures
         stored += len(committed.files)
         for file in committed.files:
-            yield file.report if file.digest in new else _not_new(warehouse, file)
+            yield file.report if file.digest in new else _report_stored(warehouse, file)
             new -= {file.digest}  # a second file with the same content is not new
             if cache is not None:
                 cache.remember(file.log, file.digest)
     if failures:
-        raise _joined(failures, stored)
+        raise _join_failures(failures, stored)
 
 
-def _written(
+def _write_batches(
     executor: Executor | None, write: Callable[[Batch], WrittenBatch], batches: Iterable[Batch]
 ) -> Iterator[tuple[Batch, WrittenBatch]]:
     """Yield each batch with its result, large files last and not by threads."""
-    alone: list[Batch] = []
+    large: list[Batch] = []
     if isinstance(executor, ThreadPoolExecutor):
-        together: list[Batch] = []
-        for batch in batches:
-            (alone if size_of(batch[0].file) >= BATCH_BYTES else together).append(batch)
-        batches = together
+        small: list[Batch] = []
+        for batch in batches:  # a large file is a batch of its own
+            (large if size_of(batch[0].file) >= BATCH_BYTES else small).append(batch)
+        batches = small
     yield from run_tasks(executor, write, batches, lambda batch: str(batch[0].file))
-    yield from ((batch, write(batch)) for batch in alone)
+    yield from ((batch, write(batch)) for batch in large)
 
 
 def _batches(files: Iterable[IngestTask]) -> Iterator[Batch]:
@@ -249,18 +251,18 @@ def _batches(files: Iterable[IngestTask]) -> Iterator[Batch]:
         yield tuple(batch)
 
 
-def _not_new(warehouse: Warehouse, written: WrittenFile) -> IngestReport:
-    """Return the report of a file that this process did not commit."""
+def _report_stored(warehouse: Warehouse, written: WrittenFile) -> IngestReport:
+    """Return the report of a file whose content was stored before, or erased."""
     report = dataclasses.replace(written.report, new=False, suspicions=(), drives_replaced=0)
     if report.drives_forgotten or not ErasureLog(warehouse.root).entries():
         return report
-    if drives_of(warehouse, {SourceRef.of_file(written.digest)}):
+    if stored_drives(warehouse, {SourceRef.of_file(written.digest)}):
         return report
     counts = dataclasses.replace(report.counts, drives=0, ticks=0)
     return dataclasses.replace(report, counts=counts, drives_forgotten=report.counts.drives)
 
 
-def _joined(failures: Sequence[Failure], stored: int) -> InputError:
+def _join_failures(failures: Sequence[Failure], stored: int) -> InputError:
     """Return one error that names each reason once; `stored` is the number of the other files."""
     if len(failures) == 1:
         return failures[0][1]
@@ -268,15 +270,15 @@ def _joined(failures: Sequence[Failure], stored: int) -> InputError:
     for file, failure in failures:
         name = quote_name(file)
         reasons.setdefault(str(failure).removeprefix(f"{name}: "), []).append(name)
-    texts = [f"{_shortened(files)}: {reason}" for reason, files in reasons.items()]
+    texts = [f"{_shorten(files)}: {reason}" for reason, files in reasons.items()]
     are_repeated = all(isinstance(failure, RepeatedError) for _, failure in failures)
     return (RepeatedError if are_repeated else InputError)(
         f"{pluralize(len(failures), 'file')} cannot be used"
-        f"{'; all others are stored' if stored else ''}. {_shortened(texts, ' ')}"
+        f"{'; all others are stored' if stored else ''}. {_shorten(texts, ' ')}"
     )
 
 
-def _shortened(texts: Sequence[str], separator: str = ", ") -> str:
+def _shorten(texts: Sequence[str], separator: str = ", ") -> str:
     more = f" and {len(texts) - TEXTS_SHOWN:,} more" if len(texts) > TEXTS_SHOWN else ""
     return separator.join(texts[:TEXTS_SHOWN]) + more
 
@@ -310,7 +312,7 @@ def write_batch(
         for file, of_file in zip(written, faults, strict=True)
     )
     digests = {name: sorted(data.digests) for name, data in writer.data.items()}
-    return WrittenBatch(checked, tuple(failures), writer.forgotten, added, digests)
+    return WrittenBatch(checked, tuple(failures), writer.erasures, added, digests)
 
 
 class _BatchWriter:
@@ -321,20 +323,20 @@ class _BatchWriter:
     ) -> None:
         self._warehouse, self._mapping, self._replace = warehouse, mapping, replace
         self._erasure_log = ErasureLog(warehouse.root)
-        self.forgotten = self._erasure_log.begun()
+        self.erasures = self._erasure_log.begun()
         self.data = {name: DataFiles(t, threads) for name, t in tables_of(warehouse).items()}
-        self._fingerprints: dict[str, Path] = {}
+        self._file_of_fingerprint: dict[str, Path] = {}
         """Files of the batch by their fingerprints."""
         self._refresh()
 
     def _refresh(self) -> None:
         tables = tables_of(self._warehouse).items()
         self._snapshots = {name: table.snapshot() for name, table in tables}
-        self._stored = Fingerprints(self._snapshots["logs"].transactions)
+        self._stored_fingerprints = Fingerprints(self._snapshots["logs"].transactions)
 
     def _lacks(self, name: TableName, digest: str) -> bool:
         """Return True if a file's rows are neither in a table nor in this batch."""
-        is_stored = self._snapshots[name].has_committed(FILES + digest)
+        is_stored = self._snapshots[name].has_committed(FILE_PREFIX + digest)
         return digest not in self.data[name].digests and not is_stored
 
     def write(self, task: IngestTask) -> WrittenFile:
@@ -343,13 +345,12 @@ class _BatchWriter:
         Raises `InputError`, and `RepeatedError` for a stored recording.
         """
         with open_measured(task.file, self._mapping) as log:
-            first_drive = drive_id(log.prefix, 0)
-            if not self._lacks("logs", log.digest) and readmit_file(
-                self._warehouse, log.digest, first_drive
-            ):
-                self._refresh()
             if not self._lacks("logs", log.digest):
-                for _ in log.drives():
+                is_readmitted = readmit_file(self._warehouse, log.digest, drive_id(log.prefix, 0))
+                if is_readmitted:
+                    self._refresh()
+            if not self._lacks("logs", log.digest):
+                for _ in log.drives():  # counts the rows
                     pass
                 return WrittenFile(
                     task.file, log.digest, IngestReport(str(task.file), log.counts, new=False)
@@ -364,62 +365,83 @@ class _BatchWriter:
                 raise
 
     def _write_new(self, task: IngestTask, log: MeasuredLog, *, with_rejects: bool) -> WrittenFile:
-        """Write the drives and the rejected rows of a log."""
-        ticks, erased = 0, set[str]()
-        fingerprints = {log.fingerprint: SourceRef.of_file(log.digest).number}
-        for drives in _groups(log.drives()):
-            drives.sort(key=lambda drive: drive.drive_id)
-            accepted = drop_erased_drives(drives, self._erasure_log)
-            erased |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in accepted}
-            ticks += _rows_of(accepted)
-            if accepted:
-                rows = log_table(accepted, self._mapping)
-                self.data["logs"].add(log.digest, rows, full=_rows_of(drives) >= FILE_ROWS)
-                fingerprints |= fingerprints_of(accepted)
+        """Write the drives and the rejected rows of a log; find the drives that it replaces."""
+        ticks, erased, fingerprints = self._write_drives(log)
+        # Each table of rejected rows but the last fills a data file.
         for table, following in pairwise(chain(log.quarantine(), [None])):
             if with_rejects and table is not None:
                 allowed = drop_erased_rejects(table, self._erasure_log, erased)
                 self.data["quarantine"].add(log.digest, allowed, full=following is not None)
-        if not ticks:
-            fingerprints = {}
-        earlier = task.earlier
-        if earlier and not self._snapshots["logs"].has_committed(FILES + earlier):
-            earlier = None
-        for repeated in self._fingerprints.keys() & fingerprints.keys():
+        if repeated := self._file_of_fingerprint.keys() & fingerprints.keys():
             # A file with other bytes: identical files are stored once anyway.
             raise RepeatedError(
                 f"{quote_name(task.file)}: same recording as "
-                f"{quote_name(self._fingerprints[repeated])}. Leave one of them out."
+                f"{quote_name(self._file_of_fingerprint[min(repeated)])}. Leave one of them out."
             )
-        same, replaced_drives, replaced = find_duplicates(
-            self._warehouse, self._stored, self._replace, task.file, log, fingerprints, earlier
+        earlier = task.previous_digest
+        if earlier and not self._snapshots["logs"].has_committed(FILE_PREFIX + earlier):
+            earlier = None
+        duplicates = find_duplicates(
+            self._warehouse,
+            self._stored_fingerprints,
+            self._replace,
+            task.file,
+            log,
+            fingerprints,
+            earlier,
         )
         report = IngestReport(
             str(task.file),
             dataclasses.replace(log.counts, drives=log.counts.drives - len(erased), ticks=ticks),
             suspicions=log.suspicions(),
             drives_forgotten=len(erased),
-            drives_replaced=len(replaced_drives),
+            drives_replaced=len(duplicates.replaced_drives),
         )
-        self._fingerprints |= dict.fromkeys(fingerprints, task.file)
+        self._file_of_fingerprint |= dict.fromkeys(fingerprints, task.file)
         for data in self.data.values():
             data.end_log()
-        return WrittenFile(task.file, log.digest, report, log.longest, fingerprints, same, replaced)
+        return WrittenFile(
+            task.file,
+            log.digest,
+            report,
+            log.longest,
+            fingerprints,
+            duplicates.sources,
+            duplicates.replaced,
+        )
+
+    def _write_drives(self, log: MeasuredLog) -> tuple[int, set[str], dict[str, int]]:
+        """Write the drives of a log; return the ticks, the erased drives, and the fingerprints.
+
+        A log of erased drives only has no fingerprints.
+        """
+        ticks, erased = 0, set[str]()
+        fingerprints = {log.fingerprint: SourceRef.of_file(log.digest).number}
+        for drives in _group_drives(log.drives()):
+            drives.sort(key=lambda drive: drive.drive_id)
+            accepted = drop_erased_drives(drives, self._erasure_log)
+            erased |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in accepted}
+            ticks += _count_ticks(accepted)
+            if accepted:
+                rows = log_table(accepted, self._mapping)
+                self.data["logs"].add(log.digest, rows, full=_count_ticks(drives) >= FILE_ROWS)
+                fingerprints |= fingerprints_of(accepted)
+        return ticks, erased, fingerprints if ticks else {}
 
 
-def _groups(drives: Iterable[MeasuredDrive]) -> Iterator[list[MeasuredDrive]]:
+def _group_drives(drives: Iterable[MeasuredDrive]) -> Iterator[list[MeasuredDrive]]:
     """Yield groups of drives with the rows of a data file; the last group may have fewer."""
     group: list[MeasuredDrive] = []
     for drive in drives:
         group.append(drive)
-        if _rows_of(group) >= FILE_ROWS:
+        if _count_ticks(group) >= FILE_ROWS:
             yield group
             group = []
     if group:
         yield group
 
 
-def _rows_of(drives: Iterable[MeasuredDrive]) -> int:
+def _count_ticks(drives: Iterable[MeasuredDrive]) -> int:
     return sum(drive.ticks.size for drive in drives)
 
 
@@ -464,29 +486,30 @@ def _preview_log(log: Path, mapping: Mapping) -> tuple[Preview, MeasuredDrive | 
 
 
 CHECKED_TICKS, MIN_CHECKED_TICKS = 60_000, 6_000
-"""Ticks that are checked in a batch of files, ten minutes, and in each file, a minute."""
+"""Ticks to check: in a batch of files at most ten minutes, but in each file a minute."""
 
 
 def check_longest(
     mapping: Mapping, drives: Sequence[MeasuredDrive | None]
 ) -> list[tuple[Fault, ...]]:
-    """Check the longest drive of each file; return a fault with the longest drive that has it.
+    """Check the longest drive of each file; return the faults by file.
 
-    `CHECKED_TICKS` bound the time of a batch: a check takes as long as loading a small file.
+    A fault of several drives is reported once, for the longest of them. `CHECKED_TICKS` bounds the
+    time of a batch: a check takes as long as loading a small file.
     """
     present = [(place, drive) for place, drive in enumerate(drives) if drive is not None]
     present.sort(key=lambda pair: pair[1].ticks.size, reverse=True)
     from_velocities = mapping.label is not None and mapping.label.from_velocities
-    places: dict[tuple[str, tuple[str, ...]], list[tuple[int, Fault]]] = {}
+    same_faults: dict[tuple[str, tuple[str, ...]], list[tuple[int, Fault]]] = {}
     for place, drive in present:
         ticks = max(CHECKED_TICKS // len(present), MIN_CHECKED_TICKS)
         signals = signals_of(mapping.signal_catalog, drive, ticks)
         for fault in check_plausibility(
             mapping.signal_catalog, signals, from_velocities=from_velocities
         ):
-            places.setdefault((fault.kind, fault.signals), []).append((place, fault))
+            same_faults.setdefault((fault.kind, fault.signals), []).append((place, fault))
     faults: list[tuple[Fault, ...]] = [()] * len(drives)
-    for (place, fault), *repeats in places.values():
+    for (place, fault), *repeats in same_faults.values():
         also = f", as in {pluralize(len(repeats), 'other file')}" if repeats else ""
         faults[place] += (dataclasses.replace(fault, figure=fault.figure + also),)
     return faults
@@ -512,18 +535,18 @@ class DataFiles:
         """Take the table, and threads to write with."""
         self._table, self._threads = table, threads
         self._written: list[tuple[str, Future[list[AddAction]]]] = []
-        """Data files by the digest of their log, empty for several logs."""
+        """Data files, each with the digest of its log, or "" for rows of several logs."""
         self._waiting: dict[str, pa.Table] = {}
         """Rows that share a data file with those of other logs, by digest."""
         self.digests = set[str]()
 
     def add(self, digest: str, rows: pa.Table, *, full: bool) -> None:
-        """Write rows of a log to a data file of their own if `full`, else keep them for others."""
+        """Write rows of a log to a separate data file if `full`, else to a shared one later."""
         if not rows.num_rows:
             return
         self.digests.add(digest)
         if full:
-            number = 1 + sum(of_log == digest for of_log, _ in self._written)
+            number = 1 + sum(log_digest == digest for log_digest, _ in self._written)
             self._begin(f"measured-{digest[:24]}-{number}", [rows], digest)
         else:
             self._waiting[digest] = rows
@@ -534,9 +557,9 @@ class DataFiles:
             self._write_waiting()
 
     def discard(self, digest: str) -> None:
-        """Delete what was written of a log that has not ended."""
-        for of_log, writing in self._written:
-            if of_log == digest and writing.exception() is None:
+        """Delete the data files and rows of a log whose reading failed."""
+        for log_digest, writing in self._written:
+            if log_digest == digest and writing.exception() is None:
                 self._table.discard(writing.result())
         self._written = [pair for pair in self._written if pair[0] != digest]
         self._waiting.pop(digest, None)
@@ -551,7 +574,7 @@ class DataFiles:
         """Write waiting rows in the order of their logs' digests, which is that of drive names."""
         if self._waiting:
             digests, rows = zip(*sorted(self._waiting.items()), strict=True)
-            self._begin(f"measured-{digest_of(digests)[:24]}", list(rows))
+            self._begin(f"measured-{combine_digests(digests)[:24]}", list(rows))
             self._waiting = {}
 
     def _begin(self, name: str, rows: list[pa.Table], digest: str = "") -> None:
@@ -575,14 +598,14 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
     """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
     signals, measured = mapping.signal_catalog, set(mapping.signal_names)
     sizes = [drive.ticks.size for drive in drives]
-    of_drive = pa.schema([signals.log_schema.field("day"), *signals.drive_schema])
-    metadata = [{name: drive.metadata.get(name) for name in of_drive.names} for drive in drives]
-    # Polars makes them, since Arrow imports pandas for Python's objects if that is installed.
-    schema = pl.DataFrame(of_drive.empty_table()).schema
-    named = pl.DataFrame(metadata, schema, strict=False).to_arrow().cast(of_drive)
+    drive_schema = pa.schema([signals.log_schema.field("day"), *signals.drive_schema])
+    metadata = [{name: drive.metadata.get(name) for name in drive_schema.names} for drive in drives]
+    # Polars converts the objects: Arrow would import pandas for it, if that is installed.
+    schema = pl.DataFrame(drive_schema.empty_table()).schema
+    drive_table = pl.DataFrame(metadata, schema, strict=False).to_arrow().cast(drive_schema)
     columns: dict[str, pa.ChunkedArray] = {}
-    for column in of_drive:
-        values = named[column.name].combine_chunks()
+    for column in drive_schema:
+        values = drive_table[column.name].combine_chunks()
         if pa.types.is_string(column.type):
             encoded = values.dictionary_encode()
             codes = _repeat(encoded.indices, sizes)
@@ -614,7 +637,7 @@ def _repeat(values: pa.Array, sizes: Sequence[int]) -> pa.Array:
 
 def commit_batch(
     warehouse: Warehouse,
-    written: WrittenBatch,
+    batch: WrittenBatch,
     write_again: Callable[[], WrittenBatch],
     note: dict[str, str],
     build_removal: BuildRemoval | None = None,
@@ -627,45 +650,47 @@ def commit_batch(
     tables = tables_of(warehouse)
 
     def commit_to(name: TableName) -> frozenset[str]:
-        nonlocal written
+        nonlocal batch  # a batch that is written again stays for later attempts, and for the logs
         snapshot = tables[name].snapshot()
-        while _is_outdated(warehouse, written, name, snapshot):
+        while _is_outdated(warehouse, batch, name, snapshot):
             for other, table in tables.items():
-                table.discard(written.added[other])  # except committed ones
-            written = write_again()
+                table.discard(batch.added[other])  # except committed ones
+            batch = write_again()
             snapshot = tables[name].snapshot()
-        replaced = {source for file in written.files for source in file.replaced}
-        added, removal = written.added[name], Change()
-        if replaced and build_removal and written.added["logs"]:
+        replaced = {source for file in batch.files for source in file.replaced}
+        added, removal = batch.added[name], Change()
+        if replaced and build_removal and batch.added["logs"]:
             removal = build_removal(name, snapshot, replaced)
         if not (added or removal.remove):
             return frozenset()
-        transactions = [*removal.transactions, *map(file_transaction, written.digests[name])]
+        transactions = [*removal.transactions, *map(file_transaction, batch.digests[name])]
         if name == "logs":
-            for file in written.files:
+            for file in batch.files:
                 transactions += [AppTransaction(n, v) for n, v in file.fingerprints.items()]
-        last = {transaction.name: transaction for transaction in transactions}
-        change = Change([*added, *removal.add], removal.remove, tuple(last.values()), note)
+        # New fingerprints override the removal, which withdraws those of the replaced drives.
+        by_name = {transaction.name: transaction for transaction in transactions}
+        change = Change([*added, *removal.add], removal.remove, tuple(by_name.values()), note)
         try:
             snapshot.commit(change)
         except ConflictError:
             tables[name].discard(removal.add)
             raise
-        return frozenset(written.digests[name])
+        return frozenset(batch.digests[name])
 
     retry_conflicts(partial(commit_to, "quarantine"))
     new = retry_conflicts(partial(commit_to, "logs"))
-    return written, new
+    return batch, new
 
 
 def _is_outdated(
-    warehouse: Warehouse, written: WrittenBatch, name: TableName, snapshot: Snapshot
+    warehouse: Warehouse, batch: WrittenBatch, name: TableName, snapshot: Snapshot
 ) -> bool:
-    # After the snapshot: an erasure that begins from now on makes this commit a conflict.
-    if ErasureLog(warehouse.root).begun() != written.forgotten:
+    """Return True if an erasure or a commit since the batch was written affects its rows."""
+    # Read after the snapshot: an erasure that begins from now on makes this commit a conflict.
+    if ErasureLog(warehouse.root).begun() != batch.erasures:
         return True
-    if any(snapshot.has_committed(FILES + digest) for digest in written.digests[name]):
+    if any(snapshot.has_committed(FILE_PREFIX + digest) for digest in batch.digests[name]):
         return True
-    files = [file for file in written.files if file.fingerprints and name == "logs"]
+    files = [file for file in batch.files if file.fingerprints and name == "logs"]
     stored = Fingerprints(snapshot.transactions if files else {})
-    return any(stored.find(file.fingerprints) - file.same for file in files)
+    return any(stored.find(file.fingerprints) - file.stored_sources for file in files)

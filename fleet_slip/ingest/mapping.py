@@ -42,7 +42,7 @@ from fleet_slip.ingest.columns import (
     SignalColumn,
     TimeBase,
     is_number,
-    require_satellites,
+    require_course_columns,
     split_components,
 )
 from fleet_slip.ingest.formats.file_formats import (
@@ -66,16 +66,16 @@ MAX_CONDITIONS = 64
 class LabelSensor(Config):
     """The sensor of side-slip: its place, and whether it measures velocities or the angle.
 
-    A car that turns drives sideways before and behind its centre of gravity, so that an optical
-    sensor on the rear bumper measures another angle.
+    In a turn, points before and behind the centre of gravity have other side-slip angles, so an
+    optical sensor on the rear bumper measures another angle.
     """
 
     from_velocities: bool = False
-    """Side-slip is arctan(vy / vx), of the signals `vx` and `vy`, which are the sensor's."""
+    """Compute side-slip as arctan(vy / vx) of the sensor's velocities, `vx` and `vy`."""
     sensor_x_m: OffsetM = 0.0
-    """How far the sensor is before the centre of gravity."""
+    """Distance of the sensor before the centre of gravity, in m."""
     sensor_y_m: OffsetM = 0.0
-    """How far it is to the left of the centre of gravity."""
+    """Distance of the sensor to the left of the centre of gravity, in m."""
 
     @property
     def is_elsewhere(self) -> bool:
@@ -139,7 +139,7 @@ class FromPath(Config):
         wildcards = {"{}": "([^/]+?)", "*": "[^/]*"}
         texts = re.split(r"(\{\}|\*)", self.path)
         pattern = "".join(wildcards.get(text) or pl.escape_regex(text) for text in texts)
-        end = re.sub("[\ud800-\udfff]", "\0", "/".join(names[-depth:]))  # bytes that are no text
+        end = re.sub("[\ud800-\udfff]", "\0", "/".join(names[-depth:]))  # bytes that are not UTF-8
         # Polars, unlike Python, matches in a time that is linear in the length of both.
         value = pl.Series([end]).str.extract(f"^{pattern}$")[0]
         return None if value is None else (Path("/", *names[:-depth]), value)
@@ -163,7 +163,7 @@ class DriveMetadata(Config):
     """Metadata of drives: values, or their column or pattern of the path. Absent means null."""
 
     column: Name | None = None
-    """Every value of this column is a drive of its own."""
+    """Each value of this column is a separate drive."""
     day: date | Elsewhere | None = None
     """Date of the drive; with timestamps it may be left out and is that of the first row (UTC)."""
     vehicle_id: DriveText | Elsewhere
@@ -204,9 +204,9 @@ class FilePattern(Config):
 
 
 class Mapping(Config):
-    """How one kind of measured file becomes drives. Identifies itself by `name`.
+    """How one kind of measured file becomes drives.
 
-    It is validated with the signals of a catalog as context, and keeps them.
+    A mapping is validated with the signals of a catalog as context, and keeps them.
     """
 
     _signal_catalog: SignalCatalog = PrivateAttr()
@@ -265,7 +265,7 @@ class Mapping(Config):
                 column.require_unit_of(name, signals[name].unit)
             except ValueError as error:
                 raise ValueError(f"signals.{name}: {column.column} {error}") from None
-        require_satellites(self.signals)
+        require_course_columns(self.signals)
         if self.label is not None:
             self.label.require_signals(self.signals, self._signal_catalog.label)
         if self.file and not self.time.own_clock:
@@ -332,7 +332,7 @@ class Mapping(Config):
 
     @property
     def signal_names(self) -> tuple[str, ...]:
-        """All signals that drives have, those computed from others too."""
+        """All signals of drives, including those that are computed from other signals."""
         derived = self.label is not None and self.label.from_velocities
         label = [self._signal_catalog.label] if derived else []
         return (*self.signals, *label, *self.front_wheels)
@@ -359,7 +359,7 @@ class Mapping(Config):
 
     @property
     def _compared_numbers(self) -> dict[str, frozenset[str]]:
-        """Columns that conditions compare with numbers alone, and those of `one_of`."""
+        """Numbers of `one_of` as text, by column that conditions compare only with numbers."""
         texts = defaultdict[str, set[str]](set)
         for condition in self.where:
             texts[condition.column].update(condition.one_of)
@@ -367,7 +367,7 @@ class Mapping(Config):
 
     @property
     def _plain_numbers(self) -> PlainNumbers:
-        """Columns of which only the number counts, not how it is written."""
+        """Columns that are used only as numbers, so that they need not be read as text."""
         if len(self.time_bases()) > 1:
             return PlainNumbers()
         numbers = {signal.column for signal in self.signals.values()}
@@ -430,14 +430,14 @@ def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
     return tuple(text for text, is_assumed in texts.items() if is_assumed)
 
 
-def keep_assumptions(root: Folder, mapping: Mapping) -> None:
+def store_assumptions(root: Folder, mapping: Mapping) -> None:
     """Store the assumptions of a mapping, unless the newest entry is equal."""
     folder, assumed = DocumentFolder(root, f"{ASSUMPTIONS}/{mapping.name}"), assumptions_of(mapping)
     if assumed != _newest(folder):
         folder.append({"assumed": assumed})
 
 
-def kept_assumptions(root: Folder, mappings: Iterable[str]) -> tuple[str, ...]:
+def stored_assumptions(root: Folder, mappings: Iterable[str]) -> tuple[str, ...]:
     """Return the assumptions of the mappings of some drives. Raises `StorageError`."""
     folders = (DocumentFolder(root, f"{ASSUMPTIONS}/{name}") for name in sorted(mappings))
     return tuple(dict.fromkeys(text for folder in folders for text in _newest(folder)))

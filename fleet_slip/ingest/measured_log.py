@@ -24,7 +24,7 @@ from fleet_slip.ingest.checked_columns import (
     DriveKeys,
     IngestCounts,
     check_rows,
-    describe_refused,
+    describe_rejected,
     is_grouped,
 )
 from fleet_slip.ingest.columns import STEP_S, TIME_EPSILON_S
@@ -34,7 +34,7 @@ from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.formats.tables import partition_keys
 from fleet_slip.ingest.log_files import FileGroup, open_log
 from fleet_slip.ingest.mapping import FromColumn, Mapping
-from fleet_slip.ingest.ticks import PREFIX, MeasuredDrive, drive_id, to_ticks
+from fleet_slip.ingest.ticks import FINGERPRINT_PREFIX, MeasuredDrive, drive_id, to_ticks
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
 from fleet_slip.quality.checks import CHECKS, Check, Fault, implausible_day
 from fleet_slip.warehouse.warehouse import quarantine_schema
@@ -43,11 +43,11 @@ MAX_DRIVES = 10_000
 """Maximum number of short drives in a file. More mean a wrong time or a wrong drive column."""
 SHORT_ROWS = 1000
 MAX_TICKS = 40_000_000
-"""Maximum ticks of all drives of a file that has few rows for them."""
+"""Maximum ticks of a file, unless it has a row for each `MAX_TICKS_PER_ROW` ticks."""
 MAX_TICKS_PER_ROW = 1000
 
 
-REFUSED_ROWS = 2**18
+MAX_REJECTED_IN_MEMORY = 2**18
 """Maximum rejected rows in memory; the others are in a temporary file."""
 
 
@@ -70,14 +70,14 @@ class RejectedRows:
         self._spool = Spool()
 
     def add(self, rows: pl.DataFrame) -> None:
-        """Count rows and keep them. Raises `InputError` if the disk is full."""
+        """Count and store rows. Raises `InputError` if the disk is full."""
         if not rows.height:
             return
         self.first = self.first or rows.row(0, named=True)
         for signal, reason, number in rows.group_by("signal", "reason").len().iter_rows():
             self.counts[signal or "", reason] += number
         self._rows.append(rows)
-        if sum(frame.height for frame in self._rows) >= REFUSED_ROWS:
+        if sum(frame.height for frame in self._rows) >= MAX_REJECTED_IN_MEMORY:
             content = BytesIO()
             pl.concat(self._rows).write_ipc_stream(content)
             self._spool.add("", content.getvalue())
@@ -105,57 +105,64 @@ class MeasuredLog:
     `<mapping>-<digest>-<number>`, and `-2`, `-3` … follow where a gap in time cut one.
     """
 
-    def __init__(self, file: Path, mapping: Mapping, digest: str, content: str) -> None:
+    def __init__(self, file: Path, mapping: Mapping, digest: str, content_digest: str) -> None:
         """Take the file, the mapping, and the two digests of `_identity`."""
         self.file, self.mapping, self.digest = file, mapping, digest
-        self.fingerprint = f"{PREFIX}{content[:16]}"
+        self.fingerprint = f"{FINGERPRINT_PREFIX}{content_digest[:16]}"
         self.prefix = f"{mapping.name}-{digest[:12]}"
         self._keys = DriveKeys()
         self.counts = IngestCounts()
         self.longest: MeasuredDrive | None = None
         self._rejected = RejectedRows()
-        self._samples, self._values = Counter[str](), Counter[str]()
-        self._drives_of_group: Counter[int] = Counter()
+        self._samples, self._values_on_ticks = Counter[str](), Counter[str]()
+        """Numbers of samples in the file, and of values on ticks, by signal."""
+        self._segments: Counter[int] = Counter()
+        """Number of drives of each group so far: the segments between gaps in time."""
         self._changed = date.fromtimestamp(file.stat().st_mtime)
         self._implausible_days: list[tuple[date, str]] = []
         self._trips: dict[int, tuple[str, float]] = {}
         """The trip of each group's last drive, and when that ended."""
-        self._under_way = defaultdict[str, list[tuple[float, float]]](list)
-        """The first and the last time of the drives of each car, where they are dated."""
+        self._times_s = defaultdict[str, list[tuple[float, float]]](list)
+        """The first and the last time of the dated drives of each car."""
         self.name = os.fsencode(file.name).decode("utf-8", "replace")
         self._stem = self.name.split(".", 1)[0] or self.name
 
     def drives(self) -> Iterator[MeasuredDrive]:
-        """Yield the drives of the file as they end, once. Raises `InputError`, at its end too.
+        """Yield the drives of the file as they end. It can be called once.
 
-        Their order depends on the file and the mapping only.
+        The order depends on the file and the mapping only. Raises `InputError`, also at the end.
         """
         grouped = is_grouped(self.file, self.mapping)
         cutter = DriveCutter(self.mapping.time.split_gap_s, self._rejected.add)
         with closing(read_ahead(self._checked_rows())) as blocks:
             for block in blocks if grouped else sort_by_group(blocks):
-                yield from self._drives(cutter.cut(block))
-            yield from self._drives(cutter.end_group())
+                yield from self._resample(cutter.cut(block))
+            yield from self._resample(cutter.end_group())
         self.counts.quarantined = self._rejected.by_reason()
         self._require_usable()
 
     def _checked_rows(self) -> Iterator[pl.DataFrame]:
-        """Yield the good rows of each batch; keep the others."""
+        """Yield the good rows of each batch; store the rejected ones."""
         for rows, refused in check_rows(self.file, self.mapping, self._keys, self.counts):
             self._rejected.add(refused)
             yield rows
 
-    def _drives(self, segments: Iterable[DriveSamples]) -> Iterator[MeasuredDrive]:
+    def _resample(self, segments: Iterable[DriveSamples]) -> Iterator[MeasuredDrive]:
+        """Yield the drives of segments; reject segments shorter than a tick."""
         for rows in segments:
             if rows.end_s - rows.start_s < STEP_S - TIME_EPSILON_S:
-                self._rejected.add(describe_refused(rows.frame, "too_short"))
-            else:
-                yield self._drive(rows)
+                self._rejected.add(describe_rejected(rows.frame, "too_short"))
+                continue
+            drive = self._drive(rows)
+            self._record(rows, drive)
+            self._require_sane_drives()
+            yield drive
 
     def _drive(self, rows: DriveSamples) -> MeasuredDrive:
+        """Name a drive, assign it to a trip, and resample it. Raises `InputError`."""
         group = rows.group
-        self._drives_of_group[group] += 1
-        name = drive_id(self.prefix, group, self._drives_of_group[group])
+        self._segments[group] += 1
+        name = drive_id(self.prefix, group, self._segments[group])
         trip_id, ended_s = self._trips.get(group, (name, rows.start_s))
         if not 0 <= rows.start_s - ended_s <= LONGEST_PAUSE_S:  # or the clock went back
             trip_id = name
@@ -164,33 +171,35 @@ class MeasuredLog:
         metadata["drive_name"] = metadata.pop("drive", self._stem)
         metadata |= {"source_file": self.name, "trip_id": trip_id}
         try:
-            drive = to_ticks(rows, self.mapping, name, metadata)
+            return to_ticks(rows, self.mapping, name, metadata)
         except InputError as error:
             raise InputError(f"{quote_name(self.file)}: {error}") from None
+
+    def _record(self, rows: DriveSamples, drive: MeasuredDrive) -> None:
+        """Add a drive to the counts, and to the figures of the checks of the file."""
         self.counts.rows_kept += rows.height
         self.counts.drives += 1
         self.counts.drives_resampled += drive.method != "snap"
         self.counts.ticks += drive.ticks.size
         for base_rows in rows.bases.values():
-            for signal in drive.values.keys() & set(base_rows.columns):
+            for signal in drive.values_on_ticks.keys() & set(base_rows.columns):
                 self._samples[signal] += base_rows[signal].count()
-        self._values.update(drive.values)
+        self._values_on_ticks.update(drive.values_on_ticks)
         if self.longest is None or drive.ticks.size > self.longest.ticks.size:
             self.longest = drive
         if drive.metadata["started_at"] is not None:
             car = str(drive.metadata["vehicle_id"])
-            self._under_way[car].append((rows.start_s, rows.end_s))
+            self._times_s[car].append((rows.start_s, rows.end_s))
         if why := implausible_day(drive.metadata["day"], self._changed):
             self._implausible_days.append((drive.metadata["day"], why))
-        self._require_sane_drives()
-        return drive
 
-    def _refuse(self, problem: str) -> InputError:
+    def _error(self, problem: str) -> InputError:
+        """Return an error that names the file and the mapping."""
         name = self.mapping.name
         return InputError(f"{quote_name(self.file)}: {problem} in the mapping {name!r}.")
 
     def _require_sane_drives(self) -> None:
-        """Raise `InputError` where drives are too many or too long for so few rows."""
+        """Raise `InputError` for too many drives, or too many ticks, for the number of rows."""
         counts, problem = self.counts, ""
         if counts.drives > MAX_DRIVES and counts.rows_kept < SHORT_ROWS * counts.drives:
             rows = counts.rows_kept / counts.drives
@@ -199,28 +208,28 @@ class MeasuredLog:
             problem = f"{counts.rows_kept:,} rows span {counts.ticks:,} ticks of 100 Hz"
         if problem:
             check = "Check the unit of time, split_gap_s and the drive's column"
-            raise self._refuse(f"{problem}. {check}")
+            raise self._error(f"{problem}. {check}")
 
     def _require_usable(self) -> None:
-        """Raise `InputError` where no row, no tick, or no value of a signal came of all rows."""
+        """Raise `InputError` if all rows together give no row, no tick or no value of a signal."""
         counts, mapping = self.counts, self.mapping
         if not counts.rows_kept and (first := self._rejected.first):
             reasons = Counter(counts.quarantined)
             texts = ", ".join(f"{n:,} {reason}" for reason, n in reasons.most_common())
-            raise self._refuse(
+            raise self._error(
                 f"none of {pluralize(reasons.total(), 'row')} is usable ({texts}; first: "
                 f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}). "
                 "Check columns, units and time"
             )
         if not counts.ticks:
-            raise self._refuse(
+            raise self._error(
                 "no row is on a tick of 100 Hz, and longest_gap_s = "
                 f"{mapping.time.longest_gap_s:g} prevents interpolation. Raise it, if the signals "
                 "change slowly enough,"
             )
         for signal, count in self._samples.items():
-            if not self._values[signal]:
-                raise self._refuse(
+            if not self._values_on_ticks[signal]:
+                raise self._error(
                     f"{signal} has {pluralize(count, 'value')} in "
                     f"{mapping.signals[signal].column!r}, and none is on a tick of 100 Hz: they "
                     "are further apart than longest_gap_s. Give the signal a longest_gap_s of its "
@@ -228,7 +237,7 @@ class MeasuredLog:
                 )
 
     def quarantine(self) -> Iterator[pa.Table]:
-        """Yield rejected rows as those of the table `quarantine`, once all drives were taken."""
+        """Yield the rows of the table `quarantine`. Call it after `drives` has ended."""
         stated, stored = self.mapping.drive.vehicle_id, quarantine_schema()
         vehicle = stated if isinstance(stated, str) else None
         metadata = enumerate(self._keys.metadata)
@@ -252,7 +261,7 @@ class MeasuredLog:
             key: n for key, n in self._rejected.counts.items() if key[0] in self.mapping.signals
         }
         faults = [*find_refusals(of_signals, counts.rows_read, counts.quarantined)]
-        if twice := sum(map(_overlaps, self._under_way.values())):
+        if twice := sum(map(_overlaps, self._times_s.values())):
             faults.append(CHECKS["one car twice at a time"].fault("time", count=twice))
         rate_khz = 1e-3 / self.longest.interval_s if self.longest else 0.0
         rate = CHECKS["rate of the samples"]
@@ -277,7 +286,11 @@ def open_measured(file: Path, mapping: Mapping) -> Iterator[MeasuredLog]:
 
 
 def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
-    """Return the digest of a file and a mapping, and that of the file and its folders' keys."""
+    """Return two digests: of the file with the mapping, and of its content alone.
+
+    The keys of its folders, `car=A7`, count as content. The first digest includes only those that
+    the mapping uses.
+    """
     if isinstance(file, FileGroup):
         digest = hashlib.sha256()
         for member, files in sorted(file.members.items()):
@@ -295,14 +308,14 @@ def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
 
 
 MAX_SPARSE_BYTES, SPARSE_RATIO = 2**30, 64
-"""A larger file is refused if it states so many times its space on disk."""
+"""A larger file is refused if its size is more than this multiple of its space on disk."""
 
 
 def _file_digest(file: Path) -> "hashlib._Hash":
     """Return the SHA-256 of a file's bytes. Raises `InputError`.
 
-    Large files that are almost all holes, which take long to read, are refused. A compressed file
-    system gives a file less space too, but such a file has no hole.
+    Large files of almost only holes are refused, since reading them takes long. A file in a
+    compressed file system takes less space too, but it has no hole.
     """
     with file_errors(file), file.open("rb") as stream:
         status = os.fstat(stream.fileno())
@@ -317,8 +330,8 @@ def _file_digest(file: Path) -> "hashlib._Hash":
         return hashlib.file_digest(stream, "sha256")
 
 
-# Faults of a log as a whole: many rejected rows, and several cars, where one is under way
-# twice, or a column named like cars is not mapped.
+# Faults of a log as a whole: many rejected rows, a car in two drives at once, and an unmapped
+# column that is named like cars.
 
 MIN_REFUSED = 10
 _REFUSED: dict[str, Check] = {
@@ -333,9 +346,10 @@ MAX_NAMES, MIN_ROWS_PER_NAME = 1000, 20
 def find_refusals(
     refused: Named[tuple[str, str], int], rows: int, reasons: Named[str, int]
 ) -> Iterator[Fault]:
-    """Yield each signal for which more than a tenth of a file's rows were refused, and all others.
+    """Yield a fault for each signal that rejects more than a tenth of a file's rows.
 
-    `refused` are rows by signal and reason, `reasons` all refused rows by reason.
+    The rejected rows of all other reasons together are a fault above the same limit. `refused` are
+    rejected rows by signal and reason, `reasons` all rejected rows by reason.
     """
     limit = max(rows * CHECKS["refused rows"].high, MIN_REFUSED)
     several = {key: count for key, count in refused.items() if count > limit}
@@ -360,7 +374,7 @@ def find_refusals(
 def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]:
     """Yield faults for unmapped columns with several values that are named like cars or trips.
 
-    `drives` is the number of drives of the file. Logs with clocks are those of one car.
+    `drives` is the number of drives of the file. A log with clocks belongs to one car.
     """
     unmapped = {
         key: words
@@ -390,9 +404,9 @@ def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]
                     yield check.fault(name, count=count, where=where)
 
 
-def _overlaps(under_way: list[tuple[float, float]]) -> int:
-    """Return how many of some drives begin while an earlier one is under way."""
-    ordered = sorted(under_way)
+def _overlaps(times_s: list[tuple[float, float]]) -> int:
+    """Return the number of drives that begin before an earlier drive has ended."""
+    ordered = sorted(times_s)
     latest = accumulate((end for _, end in ordered), max)
     return sum(
         start < end - CHECKS["one car twice at a time"].high

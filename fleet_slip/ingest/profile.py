@@ -26,7 +26,7 @@ from fleet_slip.ingest.formats.vbo import VBO_BEGINS
 from fleet_slip.ingest.log_files import FileGroup, open_log
 from fleet_slip.ingest.vocabulary import unit_called, vocabulary
 
-# Guesses how a text file is written: encoding, separator, and where header, units and data are.
+# Guesses the layout of a text file: encoding, separator, and the lines of header, units and data.
 
 _SEPARATORS = (";", "\t", "|", ",", " ")
 _LINES = 120
@@ -39,7 +39,7 @@ _BOMS = (b"\xff\xfe", b"\xfe\xff")
 
 
 def guess_layout(file: Path) -> tuple[CsvFormat, dict[str, str]]:
-    """Return how a text file is written, and the units of its columns if a line has them."""
+    """Return the layout of a text file, and the units of its columns if a line has them."""
     encoding = _guess_encoding(file)
     with file.open("rb") as stream:
         is_vbo = VBO_BEGINS.match(stream.read(2**10))
@@ -63,7 +63,7 @@ def guess_layout(file: Path) -> tuple[CsvFormat, dict[str, str]]:
 
 
 def _guess_encoding(file: Path) -> Encoding | None:
-    """Return the encoding of a text file, None if it is none."""
+    """Return the encoding of a text file, None for a binary file."""
     with file.open("rb") as stream:
         start = decompressed(stream).read(2**16)
     if start.startswith(_BOMS):
@@ -85,10 +85,10 @@ def _split(line: str, separator: str) -> list[str]:
 
 
 def _regularity(lines: list[str], separator: str) -> tuple[float, bool, float, int]:
-    """Return how well a separator splits lines.
+    """Return how well a separator splits lines, as a tuple to compare.
 
-    Which part of the last lines has numbers in equally many fields, whether a line above them has
-    as many, which part has whatever is in them, and how many they are.
+    The share of the last lines with numbers in the usual number of fields, True if a header has as
+    many fields, the share of lines with as many fields, and the number of fields.
     """
     rows = [_split(line, separator) for line in lines if line.strip()]
     last = rows[len(rows) // 2 :]
@@ -140,15 +140,15 @@ def _units(header: list[str], between: list[list[str]]) -> dict[str, str]:
 # Detection of markers for missing values: -9999, 65535, n.v.
 
 _FAR = 2.0
-"""How many times the range of the others a number lies outside of it, to be none."""
+"""Minimum distance of a marker from other values, as a multiple of their range."""
 _MIN_VALUES = 20
 
 
 def find_absent(profiles: Sequence["Profile"]) -> tuple[tuple[str, ...], tuple[float, ...]]:
     """Return the markers for missing values in channels.
 
-    All as texts, for `missing` of a mapping; and the numbers among them. A number that is a value
-    in a channel is no marker.
+    Returns all as texts, for `missing` of a mapping, and the numbers among them. A number that is a
+    plausible value in any channel is not a marker.
     """
     markers = vocabulary()["missing"]
     texts = [
@@ -172,9 +172,9 @@ def find_absent(profiles: Sequence["Profile"]) -> tuple[tuple[str, ...], tuple[f
 
 
 PROFILE_ROWS = 200_000
-"""Rows of each time base that are looked at."""
+"""Number of rows of each time base that are examined."""
 _SAMPLE_TEXTS = 200
-"""Texts that show whether a column has times, and of which format."""
+"""Number of texts that decide the format of times in a column."""
 
 
 @dataclass(frozen=True)
@@ -184,16 +184,16 @@ class Profile:
     Attributes
     ----------
     rate_hz
-        Of its time base, where the file has a clock.
+        Sample rate of its time base, if the file has a clock.
     values
-        Those looked at as numbers, NaN where there is none; of times, seconds since 1970
-        or midnight; empty for other texts.
+        The examined values as numbers, NaN for a missing value; times are seconds since 1970 or
+        midnight. Empty for other texts.
     texts
-        Some of its texts, all that are no numbers among numbers.
+        Examples of its texts; in a column of numbers, the texts that are not numbers.
     keys
-        Where it has texts or whole numbers, a number for each; else empty.
+        A number for each distinct text or whole number; empty for other columns.
     time_format
-        Of texts that are times; empty for a type that is a time.
+        Format of texts that are times; empty for a type that is a time.
     """
 
     channel: Channel
@@ -205,17 +205,17 @@ class Profile:
 
     @property
     def is_number(self) -> bool:
-        """True if there are numbers in it."""
+        """True if it contains numbers."""
         return self.time_format is None and bool(np.isfinite(self.values).any())
 
     @property
     def missing(self) -> float:
-        """Part of the rows without a number."""
+        """Share of the rows without a number."""
         return float(1 - np.isfinite(self.values).mean()) if self.values.size else 1.0
 
     @property
     def range(self) -> tuple[float, float]:
-        """The least and the largest number. There must be one."""
+        """The smallest and the largest number. There must be at least one."""
         return float(np.nanmin(self.values)), float(np.nanmax(self.values))
 
 
@@ -233,14 +233,14 @@ class FileProfile:
 
 
 def profile_file(file: Path, bus: CanBus | None = None) -> FileProfile:
-    """Look at the first `PROFILE_ROWS` rows of every channel. Raises `InputError`."""
+    """Profile the first `PROFILE_ROWS` rows of every channel. Raises `InputError`."""
     is_text = bus is None and not isinstance(file, FileGroup)
     with require_unchanged_log(file), file_errors(file), ExitStack() as opened:
         layout, units = guess_layout(file) if is_text else (CsvFormat(), {})
         formats = FileFormats(csv=layout, can=bus)
         source = opened.enter_context(open_log(file, formats))
         channels = source.channels()
-        with suppress(InputError):  # of a column; some files are read once for all of them
+        with suppress(InputError):  # some formats read the file once for all these columns
             source.bases([channel.name for channel in channels])
         bases: dict[str, list[Channel]] = defaultdict(list)
         for channel in channels:
@@ -314,7 +314,7 @@ def _profile(channel: Channel, rate_hz: float | None, column: pl.Series, csv: Cs
 
 
 def _keys(column: pl.Series) -> NDArray[np.int64]:
-    """Return a number for each text or whole number, the first ones first; empty for others."""
+    """Return a number for each text or whole number, in sorted order; empty for other columns."""
     if column.dtype.is_float() and not (column == column.round()).fill_null(value=True).all():
         return np.zeros(0, dtype=np.int64)
     return column.rank("dense").fill_null(0).cast(pl.Int64).to_numpy()
@@ -343,6 +343,6 @@ def _seconds(moments: pl.Series) -> FloatArray:
 
 
 def sample_rate_hz(time_s: FloatArray) -> float | None:
-    """Return one over the usual step of time, None if time does not go on."""
+    """Return the inverse of the median step of time; None if time does not increase."""
     step = np.median(np.diff(time_s)) if time_s.size > 1 else 0.0
     return float(1 / step) if step > 0 else None

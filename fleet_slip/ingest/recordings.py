@@ -20,7 +20,7 @@ from fleet_slip.errors import RepeatedError
 from fleet_slip.ingest.log_files import state_of
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_log import MeasuredLog
-from fleet_slip.ingest.ticks import PREFIX, MeasuredDrive
+from fleet_slip.ingest.ticks import FINGERPRINT_PREFIX, MeasuredDrive
 from fleet_slip.resources import cache_folder, keep_json
 from fleet_slip.storage.table import (
     WITHDRAWN,
@@ -68,8 +68,8 @@ def drop_erased_rejects(
 ) -> pa.Table:
     """Return the rejected rows without those of erased cars and drives.
 
-    `left_out` are the erased drives of their file. A rejected row has the name of the uncut drive,
-    which begins the names of its segments.
+    `left_out` are the erased drives of their file. A rejected row contains the name of the drive
+    before it was cut; the names of the segments begin with it.
     """
     vehicles, named = (
         set(refused[column].unique().drop_null().cast(pa.string()).to_pylist())
@@ -87,13 +87,16 @@ def drop_erased_rejects(
 
 
 # A fingerprint identifies a recording: a digest of a file's bytes, or of a drive's counts. Each is
-# a transaction in the commit of the rows, so that two processes that store one drive conflict. A
-# transaction has one number, which refers to the source without the name of a car.
+# a transaction in the commit of the rows, so that two processes that store one drive conflict. The
+# version of the transaction is a number that refers to the source without the name of a car.
 
-FILES = "ingest/"
+FILE_PREFIX = "ingest/"
 DIGEST_CHARACTERS = 10
 _DRIVES, _NUMBERS = 2**20, 2**23
-"""Hashes of drives, and numbers reserved for each digest; 0 is the file, drives are behind 2^20."""
+"""Number of drive hashes, and numbers reserved for each digest.
+
+The number of a file is digest * 2^23. The number of a drive is larger by 2^20 plus its hash.
+"""
 
 MEASURED = rf"-([0-9a-f]{{{DIGEST_CHARACTERS}}})[0-9a-f]{{2}}((-[0-9]+){{1,2}})$"
 """The end of a measured drive's name: its file's digest, and the number of the drive."""
@@ -104,7 +107,7 @@ _MEASURED = re.compile(MEASURED)
 class SourceRef(NamedTuple):
     """The source of a recording: the first characters of a file's digest, and a drive's hash.
 
-    The hash is 0 for the whole file.
+    The hash is from 1 to 2^20 - 1, and 0 for the whole file.
     """
 
     digest: str
@@ -152,8 +155,10 @@ class Fingerprints:
     def __init__(self, transactions: Named[str, int]) -> None:
         """Take the transactions of a snapshot of the logs."""
         valid = {name: number for name, number in transactions.items() if number != WITHDRAWN}
-        self._numbers = {name: n for name, n in valid.items() if name.startswith(PREFIX)}
-        self._files = [name for name in valid if name.startswith(FILES)]
+        self._numbers = {
+            name: n for name, n in valid.items() if name.startswith(FINGERPRINT_PREFIX)
+        }
+        self._files = [name for name in valid if name.startswith(FILE_PREFIX)]
 
     def find(self, fingerprints: Iterable[str]) -> frozenset[SourceRef]:
         """Return the files and drives with one of the fingerprints."""
@@ -163,86 +168,105 @@ class Fingerprints:
     def withdraw(
         self, sources: Collection[SourceRef], files: Collection[SourceRef]
     ) -> list[AppTransaction]:
-        """Return the transactions that withdraw sources' fingerprints, and fully removed files."""
+        """Return the transactions that withdraw `sources`, and the fully removed `files`."""
         of_drives = [
             name
             for name, number in self._numbers.items()
             if (source := SourceRef.of_number(number)) in sources or source.file in files
         ]
-        of_files = [n for n in self._files if SourceRef.of_file(n.removeprefix(FILES)) in files]
+        of_files = [
+            n for n in self._files if SourceRef.of_file(n.removeprefix(FILE_PREFIX)) in files
+        ]
         return [AppTransaction(name, WITHDRAWN) for name in (*of_drives, *of_files)]
 
 
 def fingerprints_of(drives: Iterable[MeasuredDrive]) -> dict[str, int]:
     """Return the fingerprint of each drive's counts, with the number of its source."""
     sources = ((drive, SourceRef.of_drive(drive.drive_id)) for drive in drives)
-    return {f"{PREFIX}{drive.counts_digest}": source.number for drive, source in sources if source}
+    return {
+        f"{FINGERPRINT_PREFIX}{drive.counts_digest}": source.number
+        for drive, source in sources
+        if source
+    }
 
 
 def file_transaction(digest: str) -> AppTransaction:
     """Return the transaction that records a file's content."""
-    return AppTransaction(f"{FILES}{digest}", 1)
+    return AppTransaction(f"{FILE_PREFIX}{digest}", 1)
 
 
-def digest_of(digests: Sequence[str]) -> str:
+def combine_digests(digests: Sequence[str]) -> str:
     """Return the digest of several files together."""
     return digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
 
 
-# A cache of this machine's files, so that a folder of thousands is not read to find nothing new.
-# The logs decide whether a content is stored.
+# A cache of the files of this machine: without it, each run would read all files of a folder to
+# find the new ones. The logs decide whether a content is stored.
 
 
 @dataclass
 class IngestCache:
     """The content that files of this machine had when they were ingested with a mapping.
 
-    `digests` contains size, time of change and digest by path.
+    `entries` contains size in bytes, time of change in ns and digest by absolute path.
     """
 
-    cache: Path
-    digests: dict[str, tuple[int, int, str]] = field(default_factory=dict)
+    file: Path
+    entries: dict[str, tuple[int, int, str]] = field(default_factory=dict)
 
     @classmethod
     def load(cls, warehouse: Warehouse, mapping: Mapping) -> "IngestCache":
         """Read the cache of a data root and a mapping."""
         about = sha256(f"{warehouse.root.uri}\n{mapping.canonical_json()}".encode()).hexdigest()
-        cache = cache_folder("ingested") / f"{about[:32]}.json"
+        file = cache_folder("ingested") / f"{about[:32]}.json"
         with suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
-            files = json.loads(cache.read_bytes())["files"]
-            return cls(cache, {path: (int(s), int(t), str(d)) for path, (s, t, d) in files.items()})
-        return cls(cache)
+            files = json.loads(file.read_bytes())["files"]
+            return cls(file, {path: (int(s), int(t), str(d)) for path, (s, t, d) in files.items()})
+        return cls(file)
 
-    def without_landed(self, files: Iterable[Path], warehouse: Warehouse) -> list[Path]:
+    def find_new_files(self, files: Iterable[Path], warehouse: Warehouse) -> list[Path]:
         """Return the files that are not in the logs, judged by size and time of change."""
-        landed = warehouse.logs.snapshot().has_committed
+        logs = warehouse.logs.snapshot()
 
-        def is_landed(file: Path) -> bool:
-            entry = self.digests.get(_name_of(file))
-            return entry is not None and state_of(file) == entry[:2] and landed(FILES + entry[2])
+        def is_stored(file: Path) -> bool:
+            entry = self.entries.get(_absolute_path(file))
+            is_unchanged = entry is not None and state_of(file) == entry[:2]
+            return entry is not None and is_unchanged and logs.has_committed(FILE_PREFIX + entry[2])
 
-        return [file for file in files if not is_landed(file)]
+        return [file for file in files if not is_stored(file)]
 
-    def digest_of(self, file: Path) -> str | None:
+    def previous_digest(self, file: Path) -> str | None:
         """Return the digest of a path's content when last ingested, None if it never was."""
-        entry = self.digests.get(_name_of(file))
+        entry = self.entries.get(_absolute_path(file))
         return None if entry is None else entry[2]
 
     def remember(self, file: Path, digest: str) -> None:
         """Record that a file is in the logs."""
         if state := state_of(file):
-            self.digests[_name_of(file)] = (*state, digest)
+            self.entries[_absolute_path(file)] = (*state, digest)
 
     def save(self) -> None:
         """Write the cache; ignores a folder that is not writable."""
-        keep_json(self.cache, {"files": self.digests})
+        keep_json(self.file, {"files": self.entries})
 
 
-def _name_of(log: Path) -> str:
-    return os.path.abspath(log)  # noqa: PTH100 - the faster
+def _absolute_path(log: Path) -> str:
+    return os.path.abspath(log)  # noqa: PTH100 - faster than pathlib
 
 
 # Files whose recording is stored already.
+
+
+class Duplicates(NamedTuple):
+    """The stored recordings of a file that was read.
+
+    `sources` have its fingerprints, even if their rows were removed. `replaced` are the sources of
+    `replaced_drives`, the stored drives that the file replaces.
+    """
+
+    sources: frozenset[SourceRef]
+    replaced_drives: list[str]
+    replaced: frozenset[SourceRef]
 
 
 def find_duplicates(
@@ -253,19 +277,18 @@ def find_duplicates(
     log: MeasuredLog,
     fingerprints: Named[str, int],
     earlier: str | None,
-) -> tuple[frozenset[SourceRef], list[str], frozenset[SourceRef]]:
-    """Return the stored recordings of a file that was read.
+) -> Duplicates:
+    """Return the stored recordings of a file that was read, and the drives that it replaces.
 
-    These are the sources with its fingerprints, also those whose rows were removed, the drives that
-    it replaces, and their sources: all drives of a file of the same name, else only duplicates.
-    `earlier` is the digest of the stored content that its path had before. Raises `RepeatedError`
-    for a recording that is not to be replaced.
+    `earlier` is the digest of the stored content that its path had before. The file replaces all
+    drives of a file with the same name, otherwise only the drives with its fingerprints. Raises
+    `RepeatedError` for stored drives that `replace` does not permit to replace.
     """
     sources = fingerprints_of_logs.find(fingerprints)
     changed = earlier is not None and earlier != log.digest
     if earlier is not None and changed:
         sources |= {SourceRef.of_file(earlier)}
-    stored = drives_of(warehouse, {source.file for source in sources})
+    stored = stored_drives(warehouse, {source.file for source in sources})
     same = {drive: SourceRef.of_drive(drive) for drive in stored if is_from(drive, sources)}
     replaced = frozenset(
         source.file if source.file in sources or stored[drive] == log.name else source
@@ -273,23 +296,27 @@ def find_duplicates(
         if source is not None
     )
     drives = [drive for drive in stored if is_from(drive, replaced)]
-    is_replaced = replace == "all" or (
-        replace == "corrected"
-        and not changed
+    # A correction is the same file, read by another mapping of the same name.
+    is_correction = (
+        not changed
         and replaced <= {source for source in sources if not source.drive}
         and {re.sub(MEASURED, "", drive) for drive in drives} <= {log.mapping.name}
     )
-    if drives and not is_replaced:
-        problem = "this recording is in the logs already"
-        problem = "it has changed since it was ingested" if changed else problem
+    may_replace = replace == "all" or (replace == "corrected" and is_correction)
+    if drives and not may_replace:
+        problem = (
+            "it has changed since it was ingested"
+            if changed
+            else "this recording is in the logs already"
+        )
         source_file, more = quote_name(stored[drives[0]]), pluralize(len(drives), "drive")
-        count = drives[0] if len(drives) == 1 else f"{more}, {drives[0]} …"
+        names = drives[0] if len(drives) == 1 else f"{more}, {drives[0]} …"
         raise RepeatedError(
-            f"{quote_name(file)}: {problem} and would count twice: {count} from {source_file}. "
+            f"{quote_name(file)}: {problem} and would count twice: {names} from {source_file}. "
             "To replace the old one: --replace. To remove it: fleet-slip forget --drive "
             f"{drives[0]}"
         )
-    return sources, drives, replaced if drives else frozenset()
+    return Duplicates(sources, drives, replaced if drives else frozenset())
 
 
 def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
@@ -306,10 +333,10 @@ def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
 
     def attempt(table: Table) -> None:
         snapshot = table.snapshot()
-        if drives_of(warehouse, {SourceRef.of_file(digest)}):
+        if stored_drives(warehouse, {SourceRef.of_file(digest)}):
             return
-        if snapshot.has_committed(f"{FILES}{digest}"):
-            transactions = (AppTransaction(f"{FILES}{digest}", WITHDRAWN),)
+        if snapshot.has_committed(f"{FILE_PREFIX}{digest}"):
+            transactions = (AppTransaction(f"{FILE_PREFIX}{digest}", WITHDRAWN),)
             snapshot.commit(Change(transactions=transactions, note={"job": "undo"}))
 
     for table in tables_of(warehouse).values():
@@ -317,7 +344,7 @@ def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
     return True
 
 
-def drives_of(warehouse: Warehouse, files: Collection[SourceRef]) -> dict[str, str]:
+def stored_drives(warehouse: Warehouse, files: Collection[SourceRef]) -> dict[str, str]:
     """Return the stored drives of some files, with their `source_file`."""
     if not files:
         return {}

@@ -1,8 +1,8 @@
 """Converts a drive to ticks and counts: its signals are resampled to 100 Hz and rounded.
 
-Each signal is resampled from its own samples, whose times are strictly increasing, so that a slow
-sensor in a fast file is as well off as one with a file of its own. Nothing is extrapolated. A
-satellite receiver's fixes become the velocity of the centre of gravity.
+Each signal is resampled from its own samples, with strictly increasing times, so that a slow sensor
+in a fast file gives the same values as in a separate file. Nothing is extrapolated. The fixes of a
+satellite receiver become the velocity of the centre of gravity.
 """
 
 from collections.abc import Mapping as Named
@@ -38,7 +38,7 @@ _SECONDS_PER_DAY = 86_400
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _FROM_MAPPING = tuple(name for name in DriveMetadata.model_fields if name != "column")
 
-PREFIX = "same/"
+FINGERPRINT_PREFIX = "same/"
 """Prefix of the name of a fingerprint's transaction; see `recordings`."""
 
 Method = Literal["snap", "interpolate", "average"]
@@ -61,10 +61,10 @@ class MeasuredDrive:
     method: Method
     ticks: NDArray[np.int32]
     counts: dict[str, pa.Array]
-    values: dict[str, int] = field(default_factory=dict)
-    """Values of each mapped signal on the ticks, before labels at low speed were dropped."""
+    values_on_ticks: dict[str, int] = field(default_factory=dict)
+    """Number of values of each mapped signal, before labels at low speed were dropped."""
     interval_s: float = STEP_S
-    """Least of the usual times between the samples of a time base."""
+    """Sample time of the fastest time base, in s."""
 
     @cached_property
     def counts_digest(self) -> str:
@@ -100,11 +100,11 @@ def to_ticks(
             values = [chunk.to_numpy() for chunk in rows.column(signal).get_chunks()]
         else:
             values = [_resample(rows, signal, grid, mapping)]
-        # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
+        # Rounding can clip only the last bit of resampling: other values are in quarantine.
         counts[signal] = round_chunks(values, signals[signal])
     if has_course:
         counts |= _fixes(rows, grid, mapping, counts)
-    values_on_ticks = {signal: len(a) - a.null_count for signal, a in counts.items()}
+    values_on_ticks = {name: len(column) - column.null_count for name, column in counts.items()}
     counts |= place_label(mapping, counts)
     if mapping.front_wheels:
         steer = [physical(signals, counts, "steer")]
@@ -112,9 +112,9 @@ def to_ticks(
     ticks = grid.ticks
     if all(column.null_count for column in counts.values()):
         columns = pl.DataFrame({signal: pl.Series(column) for signal, column in counts.items()})
-        somewhere = columns.select(pl.any_horizontal(pl.all().is_not_null())).to_series()
-        counts = {key: array.filter(somewhere.to_arrow()) for key, array in counts.items()}
-        ticks = ticks[somewhere.to_numpy()]
+        has_value = columns.select(pl.any_horizontal(pl.all().is_not_null())).to_series()
+        counts = {key: array.filter(has_value.to_arrow()) for key, array in counts.items()}
+        ticks = ticks[has_value.to_numpy()]
     metadata = _metadata(name, metadata_of_drive, rows.start_s, mapping)
     if len(ticks):
         metadata |= {"rows": len(ticks), "duration_s": (int(ticks[-1]) - int(ticks[0])) * STEP_S}
@@ -195,7 +195,7 @@ def choose_grid(time_s: FloatArray, interval_s: float, *, fill_gaps: bool = Fals
 
 
 def _resample(rows: DriveSamples, signal: str, grid: TickGrid, mapping: Mapping) -> FloatArray:
-    """Return a signal on the ticks of its drive; a value of t is in the file at t + delay."""
+    """Return a signal on the ticks of its drive. The file has the value of time t at t + delay."""
     source, samples = mapping.signals[signal], rows.samples(signal)
     time_s = samples["time"].to_numpy() - rows.start_s - source.delay_s
     values = samples[signal].to_numpy()
@@ -234,7 +234,7 @@ def place_samples(time_s: FloatArray, values: FloatArray, grid: TickGrid) -> Flo
 def find_ticks(
     ticks: IntArray | NDArray[np.int32], values: IntArray | FloatArray
 ) -> tuple[NDArray[np.intp], BoolArray]:
-    """Return where ticks are among others, which are in order, and whether they are at all."""
+    """Return the positions of `values` in the sorted `ticks`, and the mask of present values."""
     place = np.searchsorted(ticks, values)
     exists: BoolArray = place < ticks.size
     exists[exists] = ticks[place[exists]] == values[exists]
@@ -286,29 +286,30 @@ def average(
     return np.where(is_complete, mean, np.nan)
 
 
-# Fixes of a satellite receiver: which are valid, and at which ticks.
+# Valid fixes of a satellite receiver, and their ticks.
 
 SAME_RAD = 1e-6
-"""Tolerance for an equal course, above the rounding of one that is computed from velocities."""
+"""Tolerance for equal courses, above the rounding of a course from two velocities."""
 HELD_RAD = 0.005
-"""Turn of the car with an unchanged course: half a degree is the step of coarse receivers."""
+"""Maximum turn with an unchanged course: coarse receivers have steps of half a degree."""
 BACKWARDS_MPS = 8.0
-"""Nobody drives backwards faster."""
+"""Maximum speed backwards."""
 MIN_YAW_RATE_BACKWARDS_RAD_S = 0.1
-"""An accelerometer that is off by 0.15 m/s² seems to drive backwards at 1.5 m/s then, no faster."""
+"""Minimum RMS of the yaw rate: an offset of 0.15 m/s² then looks like at most 1.5 m/s backwards."""
 
 GRIDS = np.array([ticks for ticks in range(1, TICKS_PER_S + 1) if TICKS_PER_S % ticks == 0])
-"""Spacings of fixes, in ticks, of which a whole number is a second."""
+"""Spacings of fixes, in ticks, that divide a second."""
 REGULAR = 0.8
+"""Minimum share of fixes with another one exactly a second later, if the fixes are regular."""
 MAX_TICKS_BETWEEN = 25
-"""Ticks between two fixes, in which the side-slip angle is nearly a straight line."""
+"""Ticks between two fixes, for which the side-slip angle is nearly linear in time."""
 
 
 def is_held(course: FloatArray, yaw_rate: FloatArray, place: IntArray) -> BoolArray:
     """Return a mask of fixes that repeat an outdated course.
 
-    Receivers hold the course when they are slow, or report it less often than the speed. `place`
-    is the tick of each fix; `course` is of the fixes, and `yaw_rate` of the ticks.
+    Receivers hold the course when they are slow, or report it less often than the speed. `course`
+    has the shape (fixes,), `yaw_rate` (ticks,), and `place` is the tick of each fix.
     """
     heading = np.cumsum(np.nan_to_num(yaw_rate))[place] * STEP_S
     new = np.append(True, np.abs(np.diff(course)) > SAME_RAD)
@@ -320,10 +321,10 @@ def is_held(course: FloatArray, yaw_rate: FloatArray, place: IntArray) -> BoolAr
 def is_backwards(
     yaw_rate: FloatArray, ay: FloatArray, speed: FloatArray, place: IntArray
 ) -> BoolArray:
-    """Return at which fixes the car drives backwards: it is pushed to the outside of its bend.
+    """Return a mask of fixes at which the car drives backwards.
 
-    The lateral acceleration is the yaw rate times the forward speed, here by least squares over the
-    second around a fix. Straight on it does not show it, and the course is right all the same.
+    The lateral acceleration is the yaw rate times the forward speed. The sign of this speed follows
+    by least squares over the second around a fix. Straight driving does not show it.
     """
     second = np.ones(2 * round(0.5 / STEP_S) + 1)
     squares, products = (
@@ -338,10 +339,10 @@ def is_backwards(
 def on_grid(
     ticks: NDArray[np.int32], course: FloatArray, speed: FloatArray, yaw_rate: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return course and speed at regular ticks, if the fixes are at irregular ones.
+    """Return course and speed at regular ticks; regular fixes stay unchanged.
 
-    Interpolates the course minus the integral of the yaw rate, which is the slip, between two near
-    fixes. All arrays are of the ticks.
+    Interpolates the course minus the integral of the yaw rate, which is the side-slip angle,
+    between near fixes. All arrays have the shape (ticks,).
     """
     is_fix = ~np.isnan(course)
     fixes = ticks[is_fix]
@@ -350,7 +351,7 @@ def on_grid(
     later, tolerance = fixes + TICKS_PER_S, TICKS_PER_S // 10
     following = np.searchsorted(fixes, later - tolerance)
     has_later = following < np.searchsorted(fixes, later + tolerance, side="right")
-    # Of the fixes with another about a second later, most have one exactly then.
+    # Regular fixes: most with another about a second later have one exactly then.
     if not has_later.any() or np.isin(later, fixes)[has_later].mean() >= REGULAR:
         return course, speed
     heading = np.cumsum(np.nan_to_num(yaw_rate)) * STEP_S
@@ -373,8 +374,8 @@ def _fixes(
 ) -> dict[str, pa.Array]:
     """Return the counts of course and speed at the ticks nearest to the fixes, null elsewhere.
 
-    A sample that repeats the previous one is no fix. The course is null without a yaw rate, below
-    `MOVING_MPS`, and where it `is_held` or `is_backwards`.
+    A sample equal to the previous one is not a new fix. The course is null without a yaw rate,
+    below `MOVING_MPS`, and where it `is_held` or `is_backwards`.
 
     In the car's axes the antenna moves by (-r y, r x) relative to the centre of gravity, with the
     yaw rate r; a slip β causes an error of r y β / speed. A fix that is measured a fraction of a
@@ -411,8 +412,8 @@ def _fixes(
     return {name: round_chunks([values], signals[name]) for name, values in columns.items()}
 
 
-# The label is brought to the centre of gravity: with the yaw rate r, a sensor x before it and y to
-# its left has the velocities (vx - r y, vy + r x). Of an angle alone the speed is needed beside it.
+# The label is moved to the centre of gravity. With the yaw rate r, a sensor x before it and y to
+# its left has the velocities (vx - r y, vy + r x). A measured angle needs a speed for this.
 
 
 def physical(signals: SignalCatalog, counts: Named[str, pa.Array], name: str) -> FloatArray:
@@ -421,7 +422,7 @@ def physical(signals: SignalCatalog, counts: Named[str, pa.Array], name: str) ->
 
 
 def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.Array]:
-    """Return the counts of the label at the centre of gravity, and of velocities it is made of.
+    """Return the counts of the label at the centre of gravity, and of velocities that it is from.
 
     There is no label below `MOVING_MPS`, where sensors of angles report noise.
     """
@@ -448,7 +449,7 @@ def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.
 
 
 def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray | None:
-    """Return the car's speed: as it is logged, or the median of its wheels; None without both."""
+    """Return the speed in m/s: the logged one, else the median of the wheels; None without both."""
     signals = mapping.signal_catalog
     for name in OWN_SPEEDS:
         if name in counts:
@@ -463,7 +464,7 @@ def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray | None:
         pairs = zip(wheels, factors, strict=True)
         speeds = [as_floats(counts[name]) * factor for name, factor in pairs]
         return np.asarray(np.median(speeds, axis=0), dtype=np.float64)
-    # The median of counts, by comparing pairs, takes a tenth of the time.
+    # The median of four counts by comparing pairs takes a tenth of the time of numpy's.
     a, b, c, d = (pl.Series(counts[name]).to_numpy() for name in wheels)
     lower = np.maximum(np.minimum(a, b), np.minimum(c, d))
     upper = np.minimum(np.maximum(a, b), np.maximum(c, d))

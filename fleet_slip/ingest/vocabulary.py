@@ -53,7 +53,7 @@ def unit_called(text: str) -> str | None:
 
 @lru_cache(maxsize=2**10)
 def unit_behind(name: str) -> str | None:
-    """Return the unit that a name ends in, behind a blank or an underscore."""
+    """Return the unit at the end of a name, after a blank, a point or an underscore."""
     patterns = vocabulary()["suffixes"].items()
     return next((u for u, end in patterns if re.search(rf"[_\s.](?:{end})$", name.lower())), None)
 
@@ -79,7 +79,7 @@ def best_words(signal: str, name: str, section: str = "signals") -> tuple[float,
 
 @cache
 def _never(signal: str) -> tuple[frozenset[str], tuple[str, ...]]:
-    """Return words that something else is called by: whole parts, and how parts begin."""
+    """Return the words that exclude a signal: whole parts of names, and beginnings of parts."""
     never = vocabulary()["never"]
     words = {*never["all"], *never.get(signal, ())}
     return frozenset(words), tuple(word for word in words if len(word) > 4)
@@ -136,7 +136,7 @@ def _stems_of(name: str) -> list[list[str]]:
 
 @lru_cache(maxsize=2**12)
 def _pieces(part: str) -> tuple[str, ...]:
-    """Return the stems that a part is made of, nothing unless they are all of it."""
+    """Return the stems that a part consists of; empty if they do not cover the part."""
     if not part:
         return ()
     for stem in _stems():

@@ -23,26 +23,26 @@ from fleet_slip.rendering import Answer, Part, Remark, TextTable
 
 @dataclass(frozen=True)
 class Diagnosis(Answer):
-    """One model on one cohort; coefficients are in SI units, and None is what was not asked for.
+    """Diagnosis of one model on one cohort; coefficients are in SI units.
 
     Attributes
     ----------
     fitted
         Exact fit, in counts.
     cluster
-        What is independent in `robust` and `evidence`; rows of a single drive.
+        Independent units of `robust` and `evidence`; rows for a single drive.
     inflation
         Variance inflation of each input.
     condition_number
-        Of the inputs' correlation matrix.
+        Condition number of the inputs' correlation matrix.
     evidence
         Effective rows and design effect.
     units
-        Of the inputs and the intercept, by name.
-    weighed
-        The drives that `robust` of a selection would count less, by name.
+        Units of the inputs and the intercept, by name.
+    weighted
+        The drives that `robust` of a selection would down-weight, by name.
     remark
-        That the filter of a model is not examined; empty without a filter.
+        Remark that the filter of a model is not examined; empty without a filter.
     """
 
     DOCUMENT = (
@@ -67,11 +67,11 @@ class Diagnosis(Answer):
 
     @property
     def clusters(self) -> int:
-        """How many pieces of independent evidence there are."""
+        """Number of independent clusters."""
         return self.robust.degrees_of_freedom + 1 if self.cluster != "row" else 1
 
     def parts(self) -> Iterator[Part]:
-        """Return the coefficients with their errors, and which drives are unusual."""
+        """Return the coefficients with their errors, and the outlier drives."""
         both = zip(self.robust.estimates, self.naive.estimates, strict=True)
         rows = (
             {
@@ -111,7 +111,7 @@ def diagnose(cohort: Cohort, inputs: Sequence[str], *, intercept: bool = True) -
     label, scales = catalog.signals.label, catalog.input_scales
     served = cohort.complete_cases(inputs)
     moments = clustered_moments(served, intercept=intercept)
-    # A single drive or trip contains no difference of drives: then errors are by rows.
+    # Errors of a single drive or trip are by rows: there are no clusters to compare.
     alone = len(moments) < 2
     total = served.table.total()
     fits = nested_fits(total if intercept else total.about_origin(), inputs, label)

@@ -88,7 +88,7 @@ Count = Annotated[int, Field(ge=0, lt=2**63)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 
 Correlation = Annotated[FiniteFloat, Field(ge=-1 - 1e-9, le=1 + 1e-9)]
-"""Rounding may exceed 1 a little."""
+"""A correlation may exceed 1 by a rounding error."""
 
 
 _OPTIONAL = Field(exclude_if=lambda value: value is None)
@@ -268,14 +268,14 @@ LINE_ALONE = (
 
 
 class CombinedWithFilter(Config):
-    """Combination of the line, the terms of a manifest, with a filter in the identified car.
+    """Combination of the linear model of a manifest with a filter in the identified car.
 
     Attributes
     ----------
     method
         The winner among the combinations (`fleet_slip.regression.combination`).
     term
-        The column that contains filter, line and weights; None if the line alone is better.
+        The column with filter, linear model and weights; None if the linear model is better.
     rmse_deg, worst_rmse_deg
         RMSE of every method, cross-validated in inner groups of drives, and that of its worst
         group.
@@ -454,11 +454,11 @@ class Manifest(Config):
     ) -> tuple[dict[str, Fraction], Fraction]:
         """Return the coefficient of each signal, and the intercept, for counts, exactly.
 
-        For the Gram rows of a feature set of changes there is no intercept, and no column that is a
-        constant of the car: its change is zero.
+        For a feature set of changes there is no intercept, and no calibration parameter of the car:
+        constants do not change.
         """
         changes = feature_set is not None and catalog.feature_set(feature_set).change_ticks
-        # The counts are those of today: a signal's scale may have changed since the publication.
+        # Counts have the current scale of a signal, which may have changed since the publication.
         self.require_same_counts(catalog.signals)
         scales = catalog.input_scales
         unit = scales[self.label.signal]
@@ -488,7 +488,7 @@ class Manifest(Config):
         return {term.signal: plain_column(term.signal, term.sql) for term in self.terms if term.sql}
 
     def require_same_counts(self, signals: SignalCatalog) -> None:
-        """Raise `RefusedError` if counts that a column looks back on mean something else now."""
+        """Raise `RefusedError` if a signal of a column over time has another scale now."""
         for term in self.terms:
             for name, scale in (term.signal_scales or {}).items():
                 if name not in signals.signals or signals[name].scale != scale:
@@ -503,7 +503,7 @@ class Manifest(Config):
         return {term.signal: term.definition for term in self.terms if term.definition}
 
     @property
-    def line(self) -> str | None:
+    def first_stage_digest(self) -> str | None:
         """Digest of the first-stage model whose estimate is an input; None without."""
         rows = (row for definition in self.definitions.values() for row in definition.rows())
         digests = (row.made.line for row in rows if isinstance(row.made, Combination))
@@ -516,7 +516,7 @@ class Manifest(Config):
         figures, trained = self.cross_validation, self.trained_on
         drives = f"{pluralize(trained.drives, 'drive')} of {pluralize(trained.vehicles, 'car')}"
         alone = ", of the linear model alone" * bool(self.line_remark)
-        prior, line = self.prior, self.line
+        prior, digest = self.prior, self.first_stage_digest
         noise, noise_deg = "unknown, and part of the RMSE", figures.label_noise_deg
         if noise_deg is not None:
             rmse_deg = figures.beyond_label_noise_deg
@@ -539,7 +539,7 @@ class Manifest(Config):
             "why": self.selected_by.reason,
             "assumed": "; ".join(self.assumed),
             "with filter": str(self.combination or ""),
-            "first-stage model": line and f"{line}, of the feature set {trained.feature_set}",
+            "first-stage model": digest and f"{digest}, of the feature set {trained.feature_set}",
             "prior": prior
             and f"{prior.campaign}: {pluralize(prior.drives, 'simulated drive')} of "
             f"{', '.join(prior.vehicles)}, each row with the weight {prior.weight}",
@@ -548,11 +548,11 @@ class Manifest(Config):
         return {name: text for name, text in properties.items() if text}
 
     def same_estimator(self, other: "Manifest") -> bool:
-        """Return True if both have the same terms and combination from the same rows."""
-        return self.same_line(other) and self.combination == other.combination
+        """Return True if both have the same terms and combination from the same training data."""
+        return self.has_same_terms(other) and self.combination == other.combination
 
-    def same_line(self, other: "Manifest") -> bool:
-        """Return True if both have the same terms from the same rows."""
+    def has_same_terms(self, other: "Manifest") -> bool:
+        """Return True if both have the same terms from the same training data."""
         return (
             self.intercept_exact == other.intercept_exact
             and self.terms == other.terms
@@ -571,8 +571,8 @@ def require_model_name(name: str) -> str:
     return name
 
 
-# The training set of a version without the names of drives. Who has the name of a drive can test
-# whether it is in the set.
+# The training set of a version without the names of drives. With the name of a drive one can test
+# if the set contains it.
 
 _SALT = b"fleet-slip trained drives\n"
 
@@ -592,7 +592,7 @@ class TrainedDrives:
         return cls(name, salted)
 
     @classmethod
-    def unpacked(cls, name: str, content: bytes) -> "TrainedDrives":
+    def from_content(cls, name: str, content: bytes) -> "TrainedDrives":
         """Read the content of a file."""
         import numpy as np  # noqa: PLC0415 - not for show
 

@@ -1,8 +1,8 @@
 """A published model on a data frame: side-slip angles from columns in SI units.
 
-Signals are rounded to counts, as the sensors do; what is out of its valid range is missing. Terms
-are added from left to right, to the bits of a dot product in SQL. Models with columns over time
-look back within a drive.
+Signals are rounded to counts, as in the sensors; values out of range are missing. Terms are added
+from left to right, so that the result is bit for bit a dot product in SQL. Columns over time use
+earlier rows of the same drive.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ from fleet_slip.models.manifest import Manifest
 
 @dataclass(frozen=True)
 class Predictor:
-    """A published model on counts: the columns that it needs, and what a count of each adds.
+    """A published model on counts: its columns, their coefficients and scales.
 
     `coefficients` are in rad per physical value, which is `scales` times the count.
     """
@@ -43,10 +43,10 @@ class Predictor:
 
     @classmethod
     def from_manifest(cls, signals: SignalCatalog, manifest: Manifest) -> "Predictor":
-        """Return what a manifest publishes, by features of its own.
+        """Return the predictor of a manifest, with the features as the manifest defines them.
 
-        Raises `DataError` if these contradict each other, `RefusedError` if counts mean otherwise
-        now.
+        Raises `DataError` if these contradict each other, `RefusedError` if signals have other
+        scales now.
         """
         manifest = manifest.estimate
         manifest.require_same_counts(signals)
@@ -63,8 +63,7 @@ class Predictor:
     def __call__(self, drive: DriveCounts) -> FloatArray:
         """Return the estimate at each row in rad, shape (rows,); NaN where a column is missing.
 
-        Added up left to right, to the bits of a dot product in SQL. Raises `DataError` for a drive
-        that cannot be looked back on.
+        Raises `DataError` for a drive whose ticks columns over time cannot use.
         """
         coefficients, scales = np.array(self.coefficients), np.array(self.scales)
         estimate: FloatArray = np.full(len(drive.ticks), self.intercept)
@@ -82,14 +81,14 @@ def add_terms(columns: Any, coefficients: Any, scales: Any, estimate: Any) -> No
             estimate[row] += coefficient * (column[row] * scale)
 
 
-# Data frames of any kind: columns of numbers out of them, and an array of the same kind back.
+# Data frames of any kind: columns of numbers, and the result as an array of the same kind.
 
 NAMES_SHOWN = 20
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A data frame of some library: columns as Arrow arrays by name, and how to wrap an answer."""
+    """A data frame of any library: Arrow arrays by name, and a function to wrap a result."""
 
     names: Sequence[str]
     column: Callable[[str], Any]
@@ -164,7 +163,7 @@ def open_frame(frame: Any) -> Frame:
             lambda values, _: values.to_numpy(zero_copy_only=False),
         )
     if hasattr(frame, "__arrow_c_stream__"):
-        with contextlib.suppress(pa.ArrowException):  # of a series, not of a frame
+        with contextlib.suppress(pa.ArrowException):  # the stream of a series
             table = pa.table(frame)
             return Frame(
                 table.column_names,

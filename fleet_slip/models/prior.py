@@ -1,7 +1,7 @@
 """Simulated drives as a prior: their Gram rows join those of real ones, with a weight.
 
-They are a function of a campaign's file: made apart from the data root whenever they are needed,
-they are in no cohort.
+They depend only on the file of a campaign. Each use simulates them in a temporary data root, so
+that no cohort contains them.
 """
 
 import os
@@ -21,7 +21,7 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
 
 NOT_LOST = "lost_control_s IS NULL"
-"""The drives of a prior in which the driver kept the car."""
+"""Predicate of the drives in which the driver kept control."""
 
 
 def simulate_prior(
@@ -30,9 +30,9 @@ def simulate_prior(
     feature_set: str,
     executor: Executor | None = None,
 ) -> Cohort:
-    """Return the Gram rows of a campaign's drives, or of its file's, in which no car was lost.
+    """Return the Gram rows of the drives of a campaign in which the driver kept control.
 
-    Raises `ConfigError` for the file, `DataError` if the car was lost in every drive.
+    Raises `ConfigError` for an invalid file, `DataError` if control was lost in every drive.
     """
     if isinstance(campaign, str):
         campaign = load_campaign(campaign, catalog.configs)

@@ -46,14 +46,14 @@ from fleet_slip.warehouse.database import parse_cohort, with_all_drives
 from fleet_slip.warehouse.gram_reader import open_grams
 from fleet_slip.warehouse.warehouse import Warehouse
 
-# How a model is trained again: as its champion was, and whether that would change anything.
+# How to train a model again: with the options of its champion, unless that changes nothing.
 
 COHORT = "cohort"
-"""Key of the predicate that was asked, where cars were left out of it."""
+"""Key of the requested predicate in stored options, if faulty drives were left out of it."""
 
 _MODEL_OPTIONS = {"models", "model", "order", "features", "label", "ranking", "criterion"}
 _MODEL_OPTIONS |= {"search", "max_features"}
-"""Options that define which models are compared: with one of these, none is taken from before."""
+"""Options that define the compared models. If one is given, no option of the champion is used."""
 
 _STORED_NAMES = {field.name: field.name for field in fields(SelectionRequest)} | {
     "order": "nested",
@@ -75,20 +75,21 @@ class Recipe:
 
 
 def stored_options(selection: Selection) -> dict[str, Any] | None:
-    """Return the options that a manifest stores; None if the name of its list is enough."""
+    """Return the options that a manifest stores; None if the name of its list is sufficient."""
     options = _options(selection.request)
     fell_back = not options and selection.model_list == LOGGED_MODELS
-    if options.keys() <= {"models"} and not fell_back:  # else the default list next time
+    # After a fallback to the list of logged signals, the next training tries the default list.
+    if options.keys() <= {"models"} and not fell_back:
         return None
     stored = {_STORED_NAMES[name]: value for name, value in options.items()}
-    is_screened = selection.asked_condition != selection.cohort.predicate.text
-    return {**stored, COHORT: selection.asked_condition} if is_screened else stored
+    is_screened = selection.requested_cohort != selection.cohort.predicate.text
+    return {**stored, COHORT: selection.requested_cohort} if is_screened else stored
 
 
 def recipe_for(
     registry: Registry, name: str, request: SelectionRequest, cohort: str | None = None
 ) -> Recipe:
-    """Return how to train a model as before, but for given options. Raises `QuestionError`."""
+    """Return the recipe of a model's champion, changed by options. Raises `QuestionError`."""
     numbers = registry.versions(name) if name in registry.names() else []
     if not numbers:
         return Recipe(request, cohort or TRAINING_DRIVES)
@@ -97,7 +98,7 @@ def recipe_for(
     if options.keys() & _MODEL_OPTIONS:
         old_cohort, verb = with_all_drives(version.manifest.trained_on.cohort), "not as"
     else:
-        old_request, old_cohort = recipe_of(version)
+        old_request, old_cohort = training_options(version)
         request, verb = replace(old_request, **options), "trained as"
     cohort = cohort or old_cohort
     models = version.manifest.selected_by.model_list
@@ -112,8 +113,11 @@ def _options(request: SelectionRequest) -> dict[str, Any]:
     return {name: x for name, x in vars(request).items() if x != getattr(default, name)}
 
 
-def recipe_of(version: ModelVersion) -> tuple[SelectionRequest, str]:
-    """Return the selection options and the cohort of a version. Raises `QuestionError`."""
+def training_options(version: ModelVersion) -> tuple[SelectionRequest, str]:
+    """Return the selection options and the cohort that a version was trained with.
+
+    Raises `QuestionError` for options that no longer exist.
+    """
     manifest = version.manifest
     cohort = with_all_drives(manifest.trained_on.cohort)
     stored = manifest.selected_by.options
@@ -150,7 +154,7 @@ def _request_of_list(version: ModelVersion) -> SelectionRequest:
 def is_current(manifest: Manifest, warehouse: Warehouse, cohort: str, models: str) -> bool:
     """Return True if a selection from a model list would give this manifest again.
 
-    It depends on table versions, cohort, list and program. Raises `ConfigError` for the list.
+    Compares table versions, cohort, list and package version. Raises `ConfigError` for the list.
     """
     model_list = load_model_list(warehouse.catalog, models)
     trained, chosen = manifest.trained_on, manifest.selected_by
@@ -209,7 +213,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
     figures, compared, label = winner.pooled, selection.compared, signals[signals.label]
     cohort = selection.cohort
     needed = (*winner.signals, signals.label)
-    drives = drives_of(selection, name)
+    drives = pack_drives(selection, name)
     definitions = catalog.definitions(cohort.feature_set)
     return Manifest(
         name=name,
@@ -321,18 +325,18 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
 
 def assumptions_of_cohort(warehouse: Warehouse, cohort: Cohort) -> tuple[str, ...]:
     """Return the assumptions of the mappings of a cohort's labelled drives."""
-    from fleet_slip.ingest.mapping import ASSUMPTIONS, kept_assumptions  # noqa: PLC0415 - units
+    from fleet_slip.ingest.mapping import ASSUMPTIONS, stored_assumptions  # noqa: PLC0415 - units
 
     if not (warehouse.root / ASSUMPTIONS).names():
         return ()
     with open_grams(warehouse, cohort.feature_set, cohort.predicate) as opened:
         rows = opened.label_sources(cohort.predicate)
     mappings = {name for source, name, _ in rows if source == MEASURED and name}
-    return kept_assumptions(warehouse.root, mappings)
+    return stored_assumptions(warehouse.root, mappings)
 
 
-def drives_of(selection: Selection, name: str) -> bytes:
-    """Return the salted hashes of the drives that a selection's winner was trained on, packed."""
+def pack_drives(selection: Selection, name: str) -> bytes:
+    """Return the salted hashes of the winner's training drives, 8 bytes each."""
     signals = (*selection.winner.model.signals, selection.cohort.catalog.signals.label)
     return TrainedDrives.from_hashes(name, selection.cohort.hash_drives_with(signals)).content
 
@@ -466,7 +470,7 @@ def decide(
     if champion and champion.manifest.same_estimator(manifest):
         return Decision("The champion is the same model.", champion)
     held = registry.history(name).held_by(CHAMPION)
-    if champion and champion.manifest.same_line(manifest):
+    if champion and champion.manifest.has_same_terms(manifest):
         reason = "The terms are the champion's."
     else:
         review = review_challenger(registry, champion, manifest, selection)
@@ -504,17 +508,17 @@ def publish_challenger(
 
     @functools.cache
     def add_version() -> ModelVersion:
-        return registry.add(manifest, drives_of(selection, manifest.name))
+        return registry.add(manifest, pack_drives(selection, manifest.name))
 
     def publish(newest_move: int) -> Publication | None:
         decision = decide(registry, manifest, selection, **options)
         if decision.champion:
             return Publication(decision.champion, False, decision.reason)
         version, alias = add_version(), CANDIDATE if decision.waits else CHAMPION
-        is_there = history.pointed_at(alias) == version.version
-        if not is_there and not history.move(alias, version.version, "publish", after=newest_move):
-            return None
-        is_new = not (decision.waits and is_there)
+        is_set = history.pointed_at(alias) == version.version
+        if not is_set and not history.move(alias, version.version, "publish", after=newest_move):
+            return None  # another process moved an alias: decide again
+        is_new = not (decision.waits and is_set)
         return Publication(version, is_new, decision.reason, decision.waits)
 
     return history.decide(publish)

@@ -1,8 +1,8 @@
-"""Model versions: immutable, numbered, each explaining itself; and aliases with their history.
+"""Model versions, immutable and numbered, and aliases with their history.
 
-models/<name>/versions/1.json, 2.json, ...     what was published
-models/<name>/versions/drives-SHA256.bin       the drives that made it, as salted hashes
-models/<name>/history/1.json, 2.json, ...      every move of an alias, with its time
+models/<name>/versions/1.json, 2.json, ...     manifests of published versions
+models/<name>/versions/drives-SHA256.bin       training drives of a version, as salted hashes
+models/<name>/history/1.json, 2.json, ...      moves of aliases, with their times
 """
 
 import re
@@ -34,10 +34,9 @@ if TYPE_CHECKING:
     from fleet_slip.warehouse.warehouse import Warehouse
 
 
-# Where the aliases of a model point, and every move that brought them there.
+# Aliases of a model, and the history of their moves.
 #
-# A move follows the moves before it directly: of two processes that decide at once, one decides
-# again.
+# Moves are numbered without gaps. If two processes decide at the same time, one decides again.
 
 FOLDER = "models"
 
@@ -56,7 +55,7 @@ T = TypeVar("T")
 
 
 class AliasMove(Config):
-    """Entry of the history: from `at` on an alias points at a version."""
+    """Entry of the history: since `at` an alias points at a version."""
 
     alias: Identifier
     version: Annotated[int, Field(ge=1, lt=10**MAX_DIGITS)]
@@ -77,7 +76,7 @@ class AliasHistory:
         return list(self.latest_moves())[::-1]
 
     def latest_moves(self) -> Iterator[AliasMove]:
-        """Yield the moves, newest first, and read each when it is needed."""
+        """Yield the moves, newest first. Reads each move when it is needed."""
         for number in reversed(self.documents.numbers()):
             document = self.documents.read(number)
             file = self.documents.file(number)
@@ -87,7 +86,7 @@ class AliasHistory:
         """Return the version that an alias points at, or None."""
         return next((move.version for move in self.latest_moves() if move.alias == alias), None)
 
-    def before(self, alias: str) -> int | None:
+    def previous_version(self, alias: str) -> int | None:
         """Return the version that an alias pointed at before, or None.
 
         Rolled back versions do not count: two rollbacks go back two versions.
@@ -109,7 +108,7 @@ class AliasHistory:
         return next(published, None)
 
     def held_by(self, alias: str) -> AliasMove | None:
-        """Return the move that keeps publications from moving an alias; None without."""
+        """Return the move that prevents publications from moving an alias; None without one."""
         moves = (move for move in self.latest_moves() if move.alias == alias)
         last = next((move for move in moves if move.command != "publish"), None)
         return last if last is not None and last.command in HOLDING else None
@@ -127,7 +126,7 @@ class AliasHistory:
         return self.documents.after_newest(decision)
 
     def move(self, alias: str, version: int, command: Command, *, after: int) -> bool:
-        """Point an alias at a version; return False if there were moves after the one given."""
+        """Point an alias at a version; return False if there are moves after the number `after`."""
         now = datetime.now(UTC)
         move = AliasMove(alias=alias, version=version, command=command, at=now)
         content = move.model_dump(mode="json", exclude_none=True)
@@ -204,10 +203,10 @@ class ModelVersion(Answer):
     def predict(self, frame: Any) -> Any:
         """Estimate the side-slip angle in rad for each row of a frame.
 
-        The frame has the columns of `columns` in SI units, as the view `log` has them; others are
-        left alone. Signals are rounded to counts, half to even, as the sensors do, and are missing
-        beyond their valid range. On the rows of the logs the angles have the bits that `score`
-        computes.
+        The frame has the columns of `columns` in SI units, as in the view `log`; other columns are
+        ignored. Signals are rounded to counts, half to even, as in the sensors, and are missing
+        beyond their valid range. On the rows of the logs the angles are bit for bit those of
+        `score`.
 
         | frame | returned, one float64 for each row | no angle |
         | --- | --- | --- |
@@ -217,14 +216,14 @@ class ModelVersion(Answer):
         | `pyarrow.Table`, a DuckDB relation, any Arrow stream | `pyarrow.ChunkedArray` | null |
         | mapping of names to arrays of shape (rows,) | `numpy.ndarray` of shape (rows,) | NaN |
 
-        A model that looks back does so within a drive: by the columns `drive_id` and `tick` or
-        `time_s`, if the frame has them; else its rows are the ticks of one drive, in their order.
+        A model with windows uses earlier rows of the same drive: the columns `drive_id` and `tick`
+        or `time_s` define them. Without these columns the rows are consecutive ticks of one drive.
 
         There is no angle where an input is null or NaN, or a feature has no value, such as a
         curvature at standstill.
 
-        Raises `InputError` for a column that is missing (it says what is there), is there twice, is
-        not of numbers, has infinite ones, or differs from the others in length.
+        Raises `InputError` for a column that is missing, repeated, not numeric, infinite, or of
+        another length than the others.
         """
         from fleet_slip.models.predict import predict  # noqa: PLC0415 - DuckDB, not for show
 
@@ -286,7 +285,7 @@ class Registry:
         try:
             document = self.versions_of(name).read(version)
         except StorageError:
-            # Looked up only now: a model may have very many versions.
+            # Listed only after an error: a model may have very many versions.
             self.require(name)
             numbers = self.versions(name)
             if version in numbers:
@@ -306,16 +305,18 @@ class Registry:
             )
         return ModelVersion(version, manifest, document.sha256, self.catalog)
 
-    def only(self, or_else: str = "") -> str:
+    def only_name(self, alternatives: str = "") -> str:
         """Return the name of the only model. Raises `QuestionError` if there is not one."""
         names = self.names()
         if len(names) != 1:
-            raise QuestionError(f"name a published model{or_else}. Models: {self._listed_names}.")
+            raise QuestionError(
+                f"name a published model{alternatives}. Models: {self._listed_names}."
+            )
         return names[0]
 
     def resolve(self, reference: str | None) -> ModelVersion:
-        """Return the version of a reference, or the only model. Raises `QuestionError`."""
-        name, _, label = (reference or self.only()).partition("@")
+        """Return the version of a reference; None: of the only model. Raises `QuestionError`."""
+        name, _, label = (reference or self.only_name()).partition("@")
         self.require(name)
         label = label or CHAMPION
         if label.isascii() and label.isdigit() and len(label) <= MAX_DIGITS:
@@ -336,7 +337,7 @@ class Registry:
         return AliasHistory(DocumentFolder(self.root, f"{FOLDER}/{name}/history"))
 
     def trained_drives(self, manifest: Manifest) -> TrainedDrives:
-        """Return what drives made a version. Raises `StorageError`."""
+        """Return the training drives of a version. Raises `StorageError`."""
         expected = manifest.trained_on.drives_sha256
         folder, file = self.versions_of(manifest.name).folder, f"drives-{expected}.bin"
         content = folder.read(file)
@@ -345,13 +346,13 @@ class Registry:
                 f"{folder}/{file}: its bytes do not match the checksum in its name. Restore the "
                 "file from a backup."
             )
-        return TrainedDrives.unpacked(manifest.name, content)
+        return TrainedDrives.from_content(manifest.name, content)
 
     def add(self, manifest: Manifest, drives: bytes) -> ModelVersion:
-        """Make a manifest the next version of its model, after what tells its `drives`.
+        """Store a manifest as the next version of its model, after the hashes of its `drives`.
 
-        If the latest is the same estimator from the same rows, it is used: another process added
-        it.
+        Returns the latest version instead if it is the same estimator from the same rows: another
+        process has added it.
         """
         name, versions = manifest.name, self.versions_of(manifest.name)
         versions.folder.create(f"drives-{checksum_of_drives(drives)}.bin", drives)
@@ -369,8 +370,8 @@ class Registry:
     def promote(self, name: str, version: int, alias: str) -> None:
         """Point an alias at a version. Raises `QuestionError` for an unknown version.
 
-        Where it points there already nothing is added, unless a hold ends: one `rollback` undoes a
-        repeated command.
+        Adds no move if the alias points there already, unless this ends a hold. So one `rollback`
+        also undoes a repeated command.
         """
         self.load(name, version)
 
@@ -394,7 +395,7 @@ class Registry:
         """Point an alias back; return its version. Raises `RefusedError`, and as `load`."""
 
         def target(history: AliasHistory) -> int:
-            version = history.before(alias)
+            version = history.previous_version(alias)
             if version is None:
                 raise RefusedError(
                     f"{name}@{alias} never pointed at another version, so there is nothing to go "
@@ -511,7 +512,7 @@ class Difference(Answer):
         first, second = self.first.manifest.signals, self.second.manifest.signals
         once = tuple(f"terms.{signal}." for signal in {*first} ^ {*second})
         rows = [
-            [name, _shown(a), _shown(b)]
+            [name, _format_value(a), _format_value(b)]
             for name, (a, b) in self.facts.items()
             if not name.endswith(("_exact", "sha256"))  # for machines: --json
             and (not name.startswith(once) or name.endswith(".coefficient"))
@@ -542,7 +543,7 @@ def compare_versions(registry: Registry, first: ModelVersion, second: ModelVersi
     """Compare two versions. Raises `StorageError` if a file of training drives is damaged."""
     import numpy as np  # noqa: PLC0415 - not for show
 
-    a, b = (dict(_flat(_content(version), "")) for version in (first, second))
+    a, b = (dict(_flatten(_content(version), "")) for version in (first, second))
     names = [name for name in dict.fromkeys([*a, *b]) if a.get(name) != b.get(name)]
     facts = {name: (a.get(name), b.get(name)) for name in names}
     if first.manifest.name != second.manifest.name:  # their drives are salted differently
@@ -558,14 +559,14 @@ def _content(version: ModelVersion) -> dict[str, Any]:
     return {**content, "terms": {term.pop("signal"): term for term in content["terms"]}}
 
 
-def _flat(content: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
+def _flatten(content: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
     for name, value in content.items():
         if isinstance(value, dict):
-            yield from _flat(value, f"{path}{name}.")
+            yield from _flatten(value, f"{path}{name}.")
         else:
             yield f"{path}{name}", value
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     text = "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
     return shorten(text, _LONGEST_SHOWN, placeholder="…")

@@ -1,4 +1,4 @@
-"""How to select: the one definition of what `FleetCohort.select` and `fleet-slip select` take."""
+"""Options of a selection, for `FleetCohort.select` and `fleet-slip select`, and model lists."""
 
 import difflib
 import json
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from fleet_slip.grams.cohort import Cohort
 
 DEFAULT_MODELS = "estimator"
-"""The model list that is compared unless another is named, by `run` and every night too."""
+"""The default model list, also of `run` and `nightly`."""
 
 LOGGED_MODELS = "table1"
 """List of logged signals, for other feature sets or if the usual columns are not computed."""
@@ -40,7 +40,7 @@ Label = Literal["course"]
 """Substitutes for the label of a reference sensor."""
 
 COURSE_MODELS = COURSE_FEATURES = "course"
-"""The model list, and the feature set, that are taken for it."""
+"""Default model list and feature set of the label `course`."""
 
 DEFAULT_MAX_FEATURES = 24
 
@@ -65,7 +65,7 @@ class SelectionRequest:
     label
         `course` learns from changes of the course over ground, without a reference sensor.
     group_by
-        What defines the folds: `drive`, `vehicle`, `track`, `day`, ... Default: the list's.
+        Key of the folds: `drive`, `vehicle`, `track`, `day`, ... Default: the list's.
     folds
         Number of folds, or `each` for one fold per group. Default: the list's.
     ranking
@@ -136,7 +136,7 @@ class SelectionRequest:
 
 
 def check_tolerance(text: str) -> str:
-    """Return the text of a tolerance. Raises `ValueError` if it is none."""
+    """Return the text of a tolerance. Raises `ValueError` for any other text."""
     if not _TOLERANCE.fullmatch(text):
         raise ValueError("write an angle such as 0.025deg")
     return text
@@ -183,11 +183,11 @@ class CandidateModel(Config):
 class Search(Config):
     """A search among many inputs for at most `max_features` columns.
 
-    The `rule` chooses the size: `best` has the best cross-validated correlation; `tolerance` the
-    fewest columns with a negligibly larger error (`fleet_slip.regression.choice`); `standard error`
-    the fewest with an error that is larger by at most one standard error over folds. A search needs
-    `min_drives`, and takes at most `max_features_per_drive` unless folds are parts of drives.
-    Aliases are the names in checksums and documents of versions.
+    The `rule` chooses the size. `best`: the best cross-validated correlation. `tolerance`: the
+    fewest columns with a negligibly larger error (`fleet_slip.regression.choice`). `standard
+    error`: the fewest columns whose error is larger by at most one standard error over folds. A
+    search needs `min_drives`, and takes at most `max_features_per_drive` unless folds are parts of
+    drives. Aliases are the names in checksums and documents of versions.
     """
 
     name: str | None = Field(default=None, min_length=1, max_length=40)
@@ -316,21 +316,21 @@ def load_model_list(catalog: Catalog, name_or_path: str) -> ModelList:
 
 
 WHOLE_SET = "catalogue"
-"""As an order of signals: all inputs of the feature set, in its order."""
+"""Order of signals that means all inputs of the feature set, in its order."""
 
 
 def inputs_of(cohort: "Cohort", order: str) -> tuple[str, ...]:
-    """Return the order of inputs in a text, `catalogue` being all; raises as `require_inputs`."""
+    """Return the inputs that an order names; `catalogue` means all. Raises as `require_inputs`."""
     if order == WHOLE_SET:
         return cohort.inputs
     return require_inputs(cohort.catalog, order.split(","), cohort.feature_set)
 
 
 def require_inputs(catalog: Catalog, names: Sequence[str], feature_set: str) -> tuple[str, ...]:
-    """Return the inputs, of a family of windows or gates its members.
+    """Return the inputs of some names; a family of windows or gates is replaced by its members.
 
-    Raises `QuestionError` for an unknown one, or one that is not odd of changes, `UsageError` for a
-    repeated one.
+    Raises `QuestionError` for an unknown input and for an even column of changes, `UsageError` for
+    a repeated input.
     """
     inputs = catalog.feature_set(feature_set).inputs
     order = tuple(member for name in names for member in catalog.members(name.strip()))
@@ -347,7 +347,10 @@ def require_inputs(catalog: Catalog, names: Sequence[str], feature_set: str) -> 
 
 
 def even_columns(catalog: Catalog, names: Sequence[str], feature_set: str) -> str:
-    """Return which columns of changes are not odd in left and right, as a sentence; "" if none."""
+    """Return a sentence that names the columns of changes that are not odd; "" without any.
+
+    An odd column changes its sign if left and right are exchanged.
+    """
     has_changes = bool(catalog.feature_set(feature_set).change_ticks)
     even = [name for name in names if has_changes and not catalog.is_odd(name)]
     if not even:
@@ -359,7 +362,7 @@ def even_columns(catalog: Catalog, names: Sequence[str], feature_set: str) -> st
 
 
 def name_inputs(catalog: Catalog, inputs: Iterable[str]) -> str:
-    """Return names of inputs in a line, families by their own, and how many more there are."""
+    """Return the names of inputs or their families for a message, at most `MAX_LISTED_INPUTS`."""
     names = list(catalog.families(inputs))
     more = f" and {len(names) - MAX_LISTED_INPUTS} more (fleet-slip features)"
     return ", ".join(names[:MAX_LISTED_INPUTS]) + (more if len(names) > MAX_LISTED_INPUTS else "")
@@ -368,21 +371,21 @@ def name_inputs(catalog: Catalog, inputs: Iterable[str]) -> str:
 # The plan: a request that is validated once.
 
 GIVEN = "given"
-"""Name of a model whose inputs are named by the request."""
+"""Name of the model that a request defines by its inputs."""
 
 
 @dataclass(frozen=True)
 class SelectionPlan:
-    """A validated selection: what is compared, on which feature set and folds.
+    """A validated selection: the candidates, the feature set and the folds.
 
     Attributes
     ----------
     original
-        The request as it was given.
+        The request of the user.
     request
         The request with the name of its model list, and the label of the list.
     compared
-        All that is compared, with the options of the request; None for an order.
+        The models and searches to compare, with the options of the request; None for an order.
     """
 
     original: SelectionRequest
@@ -429,7 +432,7 @@ class SelectionPlan:
 
 
 def _default_list(request: SelectionRequest) -> str | None:
-    """Return the name of the list that is compared unless the request names one."""
+    """Return the name of the default list of a request; None if it defines models itself."""
     if request.model or request.is_ordered or request.search:
         return None
     if request.label:
@@ -472,7 +475,7 @@ def _search_of(catalog: Catalog, request: SelectionRequest, feature_set: str) ->
 
 
 def checksum_of_list(model_list: ModelList) -> str:
-    """Return the checksum of a compared list, changed by options other than the default."""
+    """Return the checksum of a list with its options; options at their default do not count."""
     default = {"label": None, "line": None, "tolerance": None, "intercept": True}
     compared = model_list.model_copy(update=default).sha256
     options: dict[str, Any] = {}

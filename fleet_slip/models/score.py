@@ -124,7 +124,7 @@ def cohort_of_rows(signals: SignalCatalog, predicate: str | Predicate) -> Predic
 def _estimate_rows(
     warehouse: Warehouse, manifest: Manifest, predicate: Predicate
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Return estimate and label in rad of the rows of a cohort that have both, and of how many.
+    """Return estimate and label in rad of the rows that have both, and the number of all rows.
 
     Rows in which the car `is_slow` do not count.
     """
@@ -180,7 +180,7 @@ def _physical(signals: SignalCatalog, rows: pa.Table, name: str) -> FloatArray:
 
 
 def calibrated_cars(warehouse: Warehouse) -> CarCounts:
-    """Return the counts of every car's numbers, by its drives so far. Raises `DataError`."""
+    """Return the counts of the calibration parameters of every car. Raises `DataError`."""
     return calibrate(warehouse).counts()
 
 

@@ -1,7 +1,4 @@
-"""Model selection: complete cases, candidates, cross-validation, choice. Reads Gram rows only.
-
-The functions stand in the order in which they run.
-"""
+"""Model selection: complete cases, candidates, cross-validation, choice. Reads Gram rows only."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -19,7 +16,7 @@ from fleet_slip.config import load_toml
 from fleet_slip.errors import ConfigError, DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import (
     FOLD_KEYS,
-    FULL,
+    FULL_WEIGHT,
     PARTS,
     Cohort,
     CompleteCases,
@@ -78,7 +75,7 @@ from fleet_slip.warehouse.warehouse import Warehouse
 def run_selection(
     warehouse: Warehouse, request: SelectionRequest, predicate: str = TRAINING_DRIVES
 ) -> Selection:
-    """Validate a request and run it. Raises as `SelectionPlan.of` and `run_plan`."""
+    """Validate a request and run it. Raises as `SelectionPlan.from_request` and `run_plan`."""
     return run_plan(warehouse, SelectionPlan.from_request(warehouse.catalog, request), predicate)
 
 
@@ -87,8 +84,9 @@ def run_plan(
 ) -> Selection:
     """Select on the drives of a predicate. Raises as `load_cohort` and `select`.
 
-    Compares the list of logged signals if the default list has no Gram rows. With `nested` a choice
-    on labels of measured drives is repeated without the drives to test, as it is for an order.
+    Compares the list of logged signals if the default list has no Gram rows. `nested` repeats the
+    choice without the drives to test if the label is that of measured drives; for an order this is
+    always done.
     """
     remark = ""
     try:
@@ -104,30 +102,31 @@ def run_plan(
         cohort = load_training_set(warehouse, plan, predicate)
     selection = select_models(cohort, plan)
     rmse_deg = selection.winner.model.pooled.rmse_deg
-    read = selection.cohort
-    quality = assess_course_label(warehouse, read.feature_set, read.predicate, rmse_deg)
-    noise_deg = None if quality else label_noise_deg(warehouse, read)
-    has_nested = plan.request.is_ordered or (nested and quality is None and noise_deg is None)
+    selected = selection.cohort
+    quality = assess_course_label(warehouse, selected.feature_set, selected.predicate, rmse_deg)
+    noise_deg = None if quality else label_noise_deg(warehouse, selected)
+    has_measured_label = quality is None and noise_deg is None
+    repeats_choice = plan.request.is_ordered or (nested and has_measured_label)
     return replace(
         selection,
         without_label=quality,
         label_noise_deg=noise_deg,
         remark=remark,
-        asked_condition=predicate,
-        nested=cross_validate_choice(cohort, plan) if has_nested else None,
+        requested_cohort=predicate,
+        nested=cross_validate_choice(cohort, plan) if repeats_choice else None,
     )
 
 
-# The noise of the label, as campaigns state it.
+# The noise of the label, which campaigns of simulated drives state.
 
 
 def label_noise_deg(warehouse: Warehouse, cohort: Cohort) -> float | None:
-    """Return the standard deviation of the label's noise, of all rows of a cohort together.
+    """Return the standard deviation of the label's noise over all rows of a cohort.
 
     It is part of every cross-validated error. The quantisation step counts as a uniform error.
-    None where no campaign states it in its `[sensors]`.
+    Returns None unless the campaigns of all rows state it in their `[sensors]`.
     """
-    if not warehouse.logs.snapshot().rows:  # all Gram rows are from messages
+    if not warehouse.logs.snapshot().rows:  # all Gram rows are from cars
         return None
     with open_grams(warehouse, cohort.feature_set, cohort.predicate) as opened:
         rows = opened.label_sources(cohort.predicate)
@@ -150,11 +149,11 @@ def _stated_rad(source: str, campaign: str | None, configs: Configs) -> float | 
         if "sensors" not in content:
             content = load_toml(configs.find("campaigns", content["base"]))
         return float(content["sensors"]["sideslip_std_rad"])
-    except (ConfigError, KeyError):  # its file is not among the configs
+    except (ConfigError, KeyError):  # the configs do not contain its file
         return None
 
 
-# Nested cross-validation: the figure of a winner is that of the folds that chose it.
+# Nested cross-validation: the folds that chose a winner understate its error.
 
 MIN_DRIVES = 3
 """Minimum number of trips to hold out whole trips; with fewer, parts of the time are held out."""
@@ -215,7 +214,7 @@ def cross_validate_choice(cohort: Cohort, plan: SelectionPlan) -> NestedErrors |
 
 
 def load_training_set(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Cohort:
-    """Read the Gram rows of a plan, of its prior too; the sums of folds alone if they suffice."""
+    """Read the Gram rows of a plan, and those of its prior; only the sums of folds if possible."""
     request = plan.request
     needs_drives = request.is_ordered or request.robust or request.half_life
     cohort = load_cohort(
@@ -230,15 +229,15 @@ def load_training_set(warehouse: Warehouse, plan: SelectionPlan, predicate: str)
 
 
 def select_models(cohort: Cohort, plan: SelectionPlan) -> Selection:
-    """Weight the drives of a cohort, then compare what a plan names. Raises as `select`."""
+    """Weight the drives of a cohort, then compare the candidates of a plan. Raises as `select`."""
     weighted: dict[str, DownweightedDrive] = {}
     full = 1
     if plan.request.half_life:
         days = cohort.drives["day"].to_pylist()
-        cohort, full = cohort.weighted(age_weights(days, plan.request.half_life)), FULL
+        cohort, full = cohort.weighted(age_weights(days, plan.request.half_life)), FULL_WEIGHT
     if plan.request.robust:
         cohort, weighted = _downweight_outliers(cohort, plan)
-        full *= FULL if weighted else 1
+        full *= FULL_WEIGHT if weighted else 1
     if plan.compared is None:
         selection = _select_order(cohort, plan)
     else:
@@ -266,16 +265,16 @@ def _downweight_outliers(
     outliers = outlier_drives(cohort.complete_cases(inputs), intercept=intercept)
     if not outliers:
         return cohort, {}
-    parts_of = {name: round(outlier.weight * FULL) for name, outlier in outliers.items()}
+    weights = {name: round(outlier.weight * FULL_WEIGHT) for name, outlier in outliers.items()}
     names = cohort.drives["drive_id"].to_pylist()
-    return cohort.weighted(np.array([parts_of.get(name, FULL) for name in names])), outliers
+    return cohort.weighted(np.array([weights.get(name, FULL_WEIGHT) for name in names])), outliers
 
 
 def outlier_drives(cases: CompleteCases, *, intercept: bool) -> dict[str, DownweightedDrive]:
     """Return the drives that `robust` down-weights, the most unusual first."""
     table = cases.table if intercept else cases.table.about_origin()
     weights = robust_weights(DriveMoments.from_table(table))
-    less = np.flatnonzero(weights.weights < FULL).tolist()
+    less = np.flatnonzero(weights.weights < FULL_WEIGHT).tolist()
     names = cases.drives["drive_id"].to_pylist()
     return {
         names[i]: weights.drive(i) for i in sorted(less, key=lambda i: -float(weights.times[i]))
@@ -283,15 +282,15 @@ def outlier_drives(cases: CompleteCases, *, intercept: bool) -> dict[str, Downwe
 
 
 MAX_LOST_SHARE = Fraction(1, 10)
-"""Maximum share of the drives that a candidate may remove from the comparison of all others."""
+"""Maximum share of the drives that a candidate may exclude from the comparison."""
 
 
 def select(cohort: Cohort, compared: ModelList) -> Selection:
     """Cross-validate candidates and searches on the rows that all can use, and choose a winner.
 
-    Skips, with the reason, candidates with absent or dependent signals, candidates that too few
-    drives have, and searches that need more drives. Raises `DataError` if none is left, or no drive
-    has the label.
+    Skips, with the reason, candidates with absent or dependent signals or on too few drives, and
+    searches that need more drives. Raises `DataError` if no candidate remains, or no drive has the
+    label.
     """
     catalog, label, folds = cohort.catalog, cohort.catalog.signals.label, folds_of(cohort, compared)
     if not folds.tables_with([label]):
@@ -342,7 +341,10 @@ def select(cohort: Cohort, compared: ModelList) -> Selection:
 def _allow(
     cohort: Cohort, compared: ModelList, skipped: dict[str, str]
 ) -> tuple[list[CandidateModel], list[Search]]:
-    """Return the candidates and the bounded searches that a cohort permits; note the others."""
+    """Return the candidates, and the searches with their limits, that a cohort permits.
+
+    Adds the reasons of all others to `skipped`.
+    """
     candidates, searches = list[CandidateModel](), list[Search]()
     for candidate in compared.model:
         if reason := even_columns(cohort.catalog, candidate.signals, cohort.feature_set):
@@ -375,10 +377,11 @@ def find_complete_cases(
     columns: Sequence[str],
     skipped: dict[str, str],
 ) -> tuple[CohortFolds, list[CandidateModel], list[str]]:
-    """Return the rows with the signals of all comparable candidates and columns, and these two.
+    """Return the rows that all comparable candidates and columns can use, and these two.
 
-    Candidates, and then columns, join one by one, the most common first, unless fewer drives would
-    have all signals than 1 - `MAX_LOST_SHARE` of the drives of the most common.
+    Candidates, and then columns, join one by one, the most common first. One that would leave fewer
+    than 1 - `MAX_LOST_SHARE` of the drives of the most common does not join; `skipped` gets the
+    reason for a candidate.
     """
 
     def drives_with(signals: Collection[str]) -> int:
@@ -425,14 +428,14 @@ def _cross_validate(
 
 
 def search_models(
-    cohort: CohortFolds, inputs: Sequence[str], catalog: Catalog, search: Search
+    shared: CohortFolds, inputs: Sequence[str], catalog: Catalog, search: Search
 ) -> SearchedModels:
     """Search among the inputs on the rows that have them all. Raises `DataError`.
 
     Folds without such a row are left out: a car that stands or creeps has no curvature.
     """
     label = catalog.signals.label
-    folds = cohort.complete_cases(inputs, label)
+    folds = shared.complete_cases(inputs, label)
 
     def fits(gram: Gram) -> list[Fit]:
         sets = stepwise_order(gram, inputs, label, search.method, search.max_features)
@@ -444,6 +447,7 @@ def search_models(
     chosen = fits(folds.total)
     tests: list[list[ErrorSums]] = [[] for _ in chosen]
     for training, fold in folds.splits():
+        # A fold may find fewer sizes; the larger ones are dropped below.
         for sums, fitted in zip(tests, fits(training), strict=False):
             sums.append(held_out_errors(fitted.model, training, fold))
     models = tuple(
@@ -482,7 +486,7 @@ def choose_by(compared: ModelList, models: Sequence[CrossValidation]) -> Winner:
 
 
 PRIOR_SHARE = Fraction(1, 8)
-"""Weight of all rows of a prior together, where those of the cohort have 1 (docs/measured.md)."""
+"""Total weight of the rows of a prior, as a share of that of the cohort (docs/measured.md)."""
 
 
 MAX_PRIOR_COST = 1 / 10
@@ -491,10 +495,10 @@ real cars a good prior costs at most a twentieth (docs/measured.md)."""
 
 
 def keeps_prior(with_prior: float, without: float, drives: int) -> bool:
-    """Return True if the RMSE of a model with a prior allows keeping the prior.
+    """Return True if the held-out RMSE with a prior is low enough to keep the prior.
 
-    It may exceed the RMSE without by `MAX_PRIOR_COST`, or 1/n for more drives n: held-out drives
-    are like the training drives, and flatter a selection.
+    It may exceed the RMSE without a prior by `MAX_PRIOR_COST`, or by 1/n for n drives if that is
+    less. Held-out drives resemble the training drives, and favour a model without a prior.
     """
     return with_prior <= without * (1 + min(MAX_PRIOR_COST, 1 / drives))
 

@@ -28,10 +28,10 @@ FOLDS = 8
 """Folds of a first-stage model: its estimate on a drive is that of the fit without its fold."""
 
 DEFAULT_LIST_ROWS = 4_000_000
-"""Maximum number of log rows that are reduced for the default model list: they take seconds."""
+"""Maximum number of log rows to reduce for the default model list, which takes seconds."""
 
 MAX_GROWTH = 2
-"""A first-stage model is fitted again where the cohort has this many times its drives."""
+"""A first-stage model is fitted again if the cohort has this many times its drives."""
 
 About = dict[str, Any]
 """Content of a `FirstStageModel`: `estimate`, `scale`, `models`, their checksum, set and cohort."""
@@ -91,7 +91,7 @@ def _first_stage_model(
 
 
 def _stored_model(warehouse: Warehouse, about: About, predicate: str) -> FirstStageModel | None:
-    """Return the stored model of the most drives, all in the cohort; None if outgrown."""
+    """Return the stored model with the most drives, all in the cohort; None if it has too few."""
     models = warehouse.stacked_models
     stored = [model for digest in models.digests() if (model := models.find(digest))]
     cohort_drives = load_cohort(warehouse, predicate).hash_drives_with(())

@@ -24,7 +24,7 @@ from fleet_slip.warehouse.database import describe_cohort
 
 @dataclass(frozen=True)
 class SearchedModels:
-    """Models of a search, of sizes 1, 2, ...; each training fold repeated the search."""
+    """Models of a search, of sizes 1, 2, ...; the search was repeated for each training fold."""
 
     search: Search
     inputs: tuple[str, ...]
@@ -39,7 +39,7 @@ class SearchedModels:
 
 @dataclass(frozen=True)
 class NestedErrors(Record):
-    """Held-out errors of a choice that is repeated without each group of drives."""
+    """Held-out errors of a choice, repeated without each group of drives."""
 
     DOCUMENT = "groups correlation=figures.correlation rmse_deg=figures.rmse_deg"
 
@@ -66,22 +66,22 @@ class Selection(Answer):
     model_list, config_sha256
         Name of what was compared, such as `table1`, and its checksum.
     compared
-        What was compared; of an order the winner. Its selection on the same data has the same
-        winner.
+        The compared models and searches; for an order only the winner. Another selection from it on
+        the same data has the same winner.
     weighted
         The drives that `robust` down-weights, the most unusual first.
     full
-        How many times a row of full weight counts.
+        Integer weight of a row without down-weighting.
     without_label
-        How good the winner is, if changes of the course alone trained it.
+        Quality of the winner if changes of the course replaced the label.
     label_noise_deg
-        Of the label, which every error has in it; None where it is not known.
-    request, asked_condition
-        What was asked for, and of which drives.
+        Noise of the label, which is part of every error; None if unknown.
+    request, requested_cohort
+        The options and the predicate of the user.
     remark
-        Why another list than the usual one was compared.
+        Reason for comparing another list than the default.
     examined
-        Which drives were left out for faulty sensors, as a sentence.
+        Sentence on the drives that were left out for faulty sensors.
     nested
         Errors with the whole choice repeated without the drives to test; None if not computed.
     """
@@ -107,7 +107,7 @@ class Selection(Answer):
     without_label: CourseLabelQuality | None = None
     label_noise_deg: float | None = None
     request: SelectionRequest = field(default_factory=SelectionRequest)
-    asked_condition: str = TRAINING_DRIVES
+    requested_cohort: str = TRAINING_DRIVES
     remark: str = ""
     examined: str = ""
     nested: NestedErrors | None = None
@@ -122,24 +122,24 @@ class Selection(Answer):
         )
 
     def parts(self, everything: bool = False, hint: str = "") -> Iterator[Part]:
-        """Return the winner and why, the best models or all; `hint` is the option for all."""
+        """Return the winner, the reason, and the best models or all; see `summarize`."""
         return summarize(self, everything, hint)
 
     @property
     def searched_winner(self) -> SearchedModels | None:
-        """The search that found the winner, if one did."""
+        """The search that found the winner; None without one."""
         signals = self.winner.model.signals
         of_search = (s for s in self.searched if signals in [model.signals for model in s.models])
         return next(of_search, None)
 
     @property
     def rows_without(self) -> int:
-        """Rows of the cohort that tell nothing of the winner: the label or a column is missing."""
+        """Rows of the cohort without the label or a column of the winner."""
         return max(self.cohort.rows - self.trained_rows, 0)
 
     @property
     def trained_rows(self) -> int:
-        """Rows that the winner was trained on; of drives that count less, so much of them."""
+        """Rows that the winner was trained on; down-weighted rows count by their weight."""
         return self.winner.model.pooled.rows // self.full
 
     @property
@@ -177,7 +177,7 @@ MIN_REPORTED_SHARE = 0.01
 
 
 def remark_skipped_rows(rows: int, total: int) -> Iterator[Remark]:
-    """Yield how many rows lack the label or a signal, if more than the first rows of windows."""
+    """Yield the number of rows without the label or a signal, unless their share is small."""
     if rows > MIN_REPORTED_SHARE * total:
         yield Remark(
             f"{rows:,} of {pluralize(total, 'row')} skipped: the label or a signal of the model is "
@@ -201,7 +201,7 @@ CONDITION_WIDTH = 120
 
 
 def summarize(selection: Selection, everything: bool = False, hint: str = "") -> Iterator[Part]:
-    """Return the winner and why, the best models or all, and how sure that is.
+    """Return the winner, the reason, a table of the best models or all, and remarks.
 
     `hint` is the option that prints all models.
     """
@@ -249,7 +249,7 @@ _LACKING = re.compile(r"these drives lack \w+")
 def group_reasons(reasons: Mapping[str, str]) -> Iterator[tuple[list[str], str]]:
     """Yield each reason once, after the names that it applies to.
 
-    Reasons with the same first missing signal are one.
+    Reasons with the same first missing signal count as one.
     """
     groups: dict[str, list[str]] = {}
     for name, reason in reasons.items():
@@ -262,7 +262,7 @@ def group_reasons(reasons: Mapping[str, str]) -> Iterator[tuple[list[str], str]]
 def _model_table(selection: Selection, everything: bool, hint: str) -> TextTable:
     """Return a table of the models, or of the best listed ones and the winner.
 
-    For models of a search it has the number of columns: these change from size to size.
+    For models of a search it shows the number of columns instead of their names.
     """
     cohort, models, where = selection.cohort, selection.models, selection.cohort.predicate.text
     searched = [] if everything else [m for s in selection.searched for m in s.models]
@@ -333,8 +333,8 @@ def in_families(catalog: Catalog, signals: Sequence[str]) -> str:
 def _order_table(choice: NestedChoice) -> TextTable:
     """Return the table of the k+1 models of an order, the empty one first.
 
-    The distance D is that of the paper's equation (2), in units of the noise: from the full model,
-    and as it is to be expected from the true one.
+    D is the distance of the paper's equation (2), in units of the noise: to the full model, and the
+    expected one to the true model.
     """
     evidence, criterion = choice.evidence, choice.rule.criterion
     size = len(choice.winner.model.signals)

@@ -29,7 +29,7 @@ from fleet_slip.errors import (
     RefusedError,
     StorageError,
 )
-from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
+from fleet_slip.grams.compute import by_kernel, by_sql, has_statement
 from fleet_slip.grams.on_board import impossible_rows, onboard_feature_sets
 from fleet_slip.grams.update import reconcile, recorded_delays, transaction_name
 from fleet_slip.models.registry import Registry
@@ -198,7 +198,7 @@ def _open_tables(warehouse: Warehouse, report: Verification) -> dict[str, Snapsh
     for table in warehouse.tables:
         name = table.folder.name
         try:
-            snapshot = table.snapshot(anew=True)
+            snapshot = table.snapshot(reload=True)
             _ = snapshot.files
             snapshots[name] = snapshot
             for file, problem in find_commit_faults(snapshot):
@@ -387,7 +387,7 @@ def verify_grams(
 
 
 def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:
-    return grams_of(wide_grams(warehouse, [file], PLAIN))
+    return grams_of(by_kernel(warehouse, [file], PLAIN))
 
 
 def verify_documents(root: Folder, report: Verification) -> None:
@@ -537,7 +537,7 @@ def _compare_ways(
         return 0
     recorded = recorded_delays(stored_in, identity)
     delays = {car: delay for path, car, delay in recorded if path == file.path and delay}
-    rows = wide_grams(warehouse, [file], feature_set, delays)
+    rows = by_kernel(warehouse, [file], feature_set, delays)
     computed, references = grams_of(rows), {"the stored Gram rows": stored}
     if has_statement(warehouse.catalog, feature_set):
         references["SQL"] = grams_of(by_sql(warehouse, [file], feature_set))

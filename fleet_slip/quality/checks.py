@@ -1,8 +1,8 @@
 """The checks for faulty sensors and labels, of `checks.toml`, and the faults that they report.
 
-`ingest` runs the checks of a log and of the rows of its drives. `quality`, `publish` and `nightly`
-run those of the rows of some drives, and of the Gram rows of all. Only the table contains
-thresholds: the checks read them there, messages show them, and docs/quality.md lists them.
+`ingest` checks a log and the rows of its drives. `quality`, `publish` and `nightly` check the rows
+of some drives, and the Gram rows of all drives. Only `checks.toml` contains thresholds; messages
+show them, and docs/quality.md lists them.
 """
 
 import tomllib
@@ -31,13 +31,13 @@ class Fault:
     Attributes
     ----------
     kind
-        Such as stuck, reversed, swapped, scaled, biased, late; see `CHECKS`.
+        Kind of the fault, such as stuck, reversed, swapped, scaled, biased or late; see `CHECKS`.
     signals
-        Those in doubt.
+        The signals in doubt.
     figure
-        The evidence.
+        The evidence, as a phrase.
     remedy
-        What to change in the mapping, or what to do.
+        The change in the mapping, or another remedy, as a sentence.
     """
 
     kind: str
@@ -63,23 +63,23 @@ class Check:
     Attributes
     ----------
     kind
-        Of the faults that it reports.
+        Kind of the faults that it reports.
     scope
         Compared data: rows of a log, signals of a drive, a drive with its peers, or the label.
     reads
-        A log while it is read, rows of a drive, or Gram rows of all drives.
+        Input: a log during ingest, rows of a drive, or Gram rows of all drives.
     message
         Evidence of a fault, with fields for figures; {low} and {high} are the threshold.
     low, high
         Lowest and highest value of sound data.
     unit
-        Of the threshold.
+        Unit of the threshold.
     remedy
-        What to change.
+        The change that corrects the fault.
     source
-        Where the threshold is from, if not from here.
+        Source of the threshold, if it is not this table.
     remedy_of_velocities
-        What to change if the label is computed from velocities, where that differs.
+        The remedy if the label is computed from velocities; empty: the same.
     """
 
     kind: str
@@ -98,7 +98,7 @@ class Check:
         return self.low <= value <= self.high
 
     def test(self, value: float, *signals: str, **figures: Any) -> "list[Fault]":
-        """Return the fault of signals if a value is not that of sound data; else an empty list."""
+        """Return the fault of signals in a list; empty for a value of sound data."""
         return [] if self.passes(value) else [self.fault(*signals, **figures)]
 
     def fault(self, *signals: str, **figures: Any) -> Fault:

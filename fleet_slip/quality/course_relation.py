@@ -24,14 +24,14 @@ from fleet_slip.quality.drive_signals import (
 )
 
 # Over some seconds the course changes by the integral of the yaw rate, `TURNED`, and by the change
-# of the side-slip angle, which on roads is nearly that of a car whose rear axle is l behind the
-# centre of gravity and gives way by K:
+# of the side-slip angle. On roads this is nearly the angle of a car whose rear axle is l behind the
+# centre of gravity and has the compliance K:
 #
 #     label = l Δ(yaw rate / speed) + K Δay + s TURNED + const,    l > 0, K < 0.
 #
-# Least squares estimates l and K, the scale 1 + s, and a noise, which times speed is a receiver's.
-# Wrong courses have other values: a heading has neither l nor K, one of another sense a scale of
-# -1, one that stands still of 0; an antenna elsewhere or a late fix moves l.
+# Least squares estimates l and K, the scale 1 + s, and a noise; times speed it is the noise of the
+# receiver. Wrong courses have other values: a heading has neither l nor K, a course of the other
+# sense has the scale -1, and a stuck course has 0. A misplaced antenna or a late fix changes l.
 
 COLUMNS = ("curvature", "ay", YAW_RATE, TURNED)
 """Columns of a Gram row of changes, before the label."""
@@ -41,7 +41,7 @@ MIN_CHANGES = 100
 MIN_TURNED_RAD = 0.05
 LEVERS_M = (CHECKS["place of the antenna"].low, CHECKS["place of the antenna"].high)
 MIN_EXPLAINED, MAX_EXPLAINED_NOISE_MPS = 0.15, 0.8
-"""A relation that explains less may have no more noise than "noise of the course" allows."""
+"""Explained share from which the relation may have this noise; below, only that of the check."""
 
 
 @dataclass(frozen=True)
@@ -51,17 +51,17 @@ class CourseRelation:
     Attributes
     ----------
     scale
-        Of the course's change to the yaw rate's integral.
+        Ratio of the course's change to the integral of the yaw rate.
     lever_m, compliance
-        L in m and K in rad per m/s².
+        The estimates of l in m and of K in rad per m/s².
     slip
-        Standard deviation of the slip that they predict, over that of a usual car.
+        Standard deviation of the side-slip by l and K, over that of a usual car.
     slip_error
         Standard error of `slip`.
     noise_mps
-        Of one fix, across the car.
+        Noise of one fix, across the car.
     explained
-        Share that they explain of the variance that the yaw rate leaves.
+        Share by l and K of the variance that the yaw rate does not explain.
     """
 
     scale: float
@@ -92,7 +92,7 @@ class CourseRelation:
 
     @property
     def misplaced(self) -> Fault | None:
-        """Return a fault if the course is that of a place that is no car's centre of gravity."""
+        """Return a fault if the course is measured outside of any car's centre of gravity."""
         check = CHECKS["place of the antenna"]
         return next(iter(check.test(self.lever_m, COURSE, lever_m=self.lever_m)), None)
 
@@ -100,8 +100,8 @@ class CourseRelation:
 def relate(moments: FloatArray, delay_s: float = 0.0) -> CourseRelation | None:
     """Return the relation in a matrix of sums of products, None if there is too little driving.
 
-    `moments` is of 1, `COLUMNS` and the label in SI units, shape (6, 6). A course that is
-    `delay_s` late is corrected by that times the change of the yaw rate.
+    `moments` has the shape (6, 6): 1, `COLUMNS` and the label, in SI units. The correction of a
+    course that is `delay_s` late is this delay times the change of the yaw rate.
     """
     changes = float(moments[0, 0])
     if changes < MIN_CHANGES:
@@ -139,11 +139,11 @@ def relate(moments: FloatArray, delay_s: float = 0.0) -> CourseRelation | None:
 
 COURSE_CHANGE_TICKS = 4 * TICKS_PER_S
 MIN_COURSE_MPS = 3.0
-"""Below, fixes of receivers are too noisy."""
+"""Minimum speed: fixes of receivers are too noisy below it."""
 
 
 def check_course(signals: Signals) -> Iterator[Fault]:
-    """Compare a course with the yaw rate, and with how a car slips; the first fault is decisive."""
+    """Compare a course with the yaw rate and the side-slip of cars; the first fault decides."""
     if not {"course", "yaw_rate"} <= set(signals):
         return
     course, turned = signals["course"], np.cumsum(signals["yaw_rate"]) * float(SAMPLE_TIME_S)
@@ -169,7 +169,7 @@ def check_course(signals: Signals) -> Iterator[Fault]:
 
 
 def _relation(signals: Signals, turned: FloatArray) -> CourseRelation | None:
-    """Return the relation of changes over some seconds, by the receiver's own speed."""
+    """Return the relation of changes over some seconds, with the speed of the receiver."""
     if not {"ay", SATELLITE_SPEED} <= set(signals):
         return None
     yaw_rate, speed = signals["yaw_rate"], signals[SATELLITE_SPEED]

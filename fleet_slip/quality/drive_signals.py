@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from fleet_slip.regression.gram import GramTable
 
 Signals: TypeAlias = Mapping[str, FloatArray]
-"""Values in SI units on consecutive ticks, NaN where there is none; all of one shape (n_ticks,)."""
+"""Values in SI units on consecutive ticks, NaN for missing values; all of shape (n_ticks,)."""
 
 TICKS_PER_S = round(1 / float(SAMPLE_TIME_S))
 MIN_TICKS = 200
@@ -24,7 +24,7 @@ MIN_TICKS = 200
 MIN_CORRELATION = 0.6
 """Minimum correlation to compare the sizes of two signals; 0.9 in a sound drive on bends."""
 MOVING_MPS = 2.0
-"""Below, satellite and optical sensors measure no angle, and receivers freeze the course."""
+"""Minimum speed: below it sensors measure no angle, and receivers freeze the course."""
 RADIUS_M, TRACK_M = 0.31, 1.55
 """Rolling radius and track width of a passenger car."""
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
@@ -39,7 +39,7 @@ SPEEDS = (*OWN_SPEEDS, *WHEELS)
 def to_regular_grid(
     catalog: SignalCatalog, ticks: NDArray[np.int32], counts: Mapping[str, FloatArray]
 ) -> Signals:
-    """Return counts at some ticks, NaN for none, in SI units on all ticks from the first."""
+    """Return counts at some ticks in SI units on all ticks from the first, NaN for missing ones."""
     signals = {}
     for name, values in counts.items():
         signals[name] = np.full(int(ticks[-1] - ticks[0]) + 1, np.nan)
@@ -64,9 +64,9 @@ def speed_mps(signals: Signals) -> FloatArray:
 
 
 def is_moving(signals: Signals) -> BoolArray:
-    """Return where any speed is above `MOVING_MPS`; everywhere without a speed.
+    """Return a mask of rows with any speed above `MOVING_MPS`; all rows without a speed.
 
-    A speed in a wrong unit does not hide that the car drives.
+    Any speed is sufficient, since another one may have a wrong unit.
     """
     speeds = [signals[name] for name in SPEEDS_OF_CAR if name in signals]
     wheels = wheel_speed_mps(signals)
@@ -77,9 +77,9 @@ def is_moving(signals: Signals) -> BoolArray:
 
 
 def is_slow(signals: Signals) -> BoolArray:
-    """Return where the speed is known and below `MOVING_MPS`: the car's own, else its wheels'.
+    """Return a mask of rows with a speed below `MOVING_MPS`: the car's own, else its wheels'.
 
-    There a label is noise, and no estimate is compared with it. Of shape (1,) without a speed.
+    A label is noise there, and no estimate is compared with it. The shape is (1,) without a speed.
     """
     speed, wheels = np.full(1, np.nan), wheel_speed_mps(signals)
     sources = [np.abs(signals[name]) for name in OWN_SPEEDS if name in signals]
@@ -89,9 +89,9 @@ def is_slow(signals: Signals) -> BoolArray:
 
 
 def slope_of(values: FloatArray, expected: FloatArray, rows: BoolArray) -> tuple[float, float]:
-    """Return values over expected, by least squares about their means, and their correlation.
+    """Return the least-squares slope of values on expected ones, and their correlation.
 
-    Both are 0 where there is too little to judge.
+    Both are about the means, and 0 for too few rows.
     """
     (slope,), _, explained = fit(values, expected[None], rows)
     return float(slope), math.copysign(math.sqrt(max(explained, 0.0)), slope)

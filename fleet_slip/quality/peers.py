@@ -6,9 +6,9 @@ origin of the signal on its prediction (gain), and the logarithm of the residual
 deviation (noise). Each is compared with the cohort's drives by median and median absolute
 deviation, which a faulty minority does not move (Huber, Robust Statistics, 1981).
 
-A faulty sensor also spoils the predictions of the others. It is the one without which all others
-agree with theirs: structured residuals (Gertler, Fault Detection and Diagnosis in Engineering
-Systems, 1998).
+A faulty sensor also spoils the predictions of other sensors. It is the sensor without which all
+other signals agree with their predictions: structured residuals (Gertler, Fault Detection and
+Diagnosis in Engineering Systems, 1998).
 """
 
 import math
@@ -51,7 +51,7 @@ class QualityThresholds(Config):
     min_drives
         Smallest number of sound drives of a vehicle model to compare others with.
     min_correlation
-        A sign of turning contradicts the others below minus this.
+        A sign of turning contradicts the others if its correlation is below minus this value.
     limit
         Largest distance of a figure from the cohort's median, in standard deviations.
     offset_floor_counts, gain_floor, noise_floor
@@ -100,7 +100,7 @@ def thresholds(configs: Configs) -> Thresholds:
 
 
 PAIRS = (("wheel_fl", "wheel_fr"), ("wheel_rl", "wheel_rr"), ("steer_fl", "steer_fr"))
-"""Signals whose plugs may be exchanged."""
+"""Pairs of signals whose plugs may be exchanged."""
 
 MAD_TO_STD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
@@ -115,11 +115,11 @@ class Prediction:
     Attributes
     ----------
     targets
-        Positions in u of the signals that are predicted.
+        Positions of the predicted signals in u, see `MeanMoments`.
     weights
         Shape (targets, k+1): the prediction is weights @ u.
     median, scale
-        Of each figure over the cohort's drives, shape (targets, 3).
+        Median and scale of each figure over the cohort's drives, shape (targets, 3).
     """
 
     targets: NDArray[np.intp]
@@ -142,8 +142,8 @@ class Prediction:
         for row, target in enumerate(at.tolist()):
             used = [0, *(p for p in predictors if p != target)]
             weights[row, used] = solve(total[np.ix_(used, used)], total[used, target])
-        bare = cls(at, weights, np.zeros((len(at), 3)), np.ones((len(at), 3)))
-        figures = bare.figures(reference)
+        unscaled = cls(at, weights, np.zeros((len(at), 3)), np.ones((len(at), 3)))
+        figures = unscaled.figures(reference)
         median = np.median(figures, axis=0)
         scale = MAD_TO_STD * np.median(np.abs(figures - median), axis=0)
         floors = [limits.offset_floor_counts, limits.gain_floor, limits.noise_floor]
@@ -163,7 +163,10 @@ class Prediction:
         return np.stack([offset, with_own / predicted, noise], axis=2)
 
     def scores(self, moments: MeanMoments) -> FloatArray:
-        """Return standard deviations from the median, (drives, targets, 3); above it for noise."""
+        """Return distances from the median in standard deviations, shape (drives, targets, 3).
+
+        The distance of the noise has a sign.
+        """
         scores = (self.figures(moments) - self.median) / self.scale
         scores[:, :, :2] = np.abs(scores[:, :, :2])
         return np.asarray(scores)
@@ -183,12 +186,12 @@ class Peers:
 
     @cached_property
     def full(self) -> Prediction:
-        """Every signal, from all the others but the label."""
+        """Prediction of every signal from all other signals but the label."""
         return self._prediction(without=None)
 
     @cached_property
     def without(self) -> dict[str, Prediction]:
-        """For each signal: every signal but that one, from the others but that one."""
+        """For each signal, the prediction of all other signals without it."""
         return {name: self._prediction(without=name) for name in self.reference.signals}
 
     def _prediction(self, without: str | None) -> Prediction:
@@ -222,7 +225,7 @@ class Peers:
                 score = scores[drive, worst]
                 faults.append(CHECKS["several signals"].fault(signals[worst], score=score))
                 continue
-            # The sensor that explains all others, and is itself furthest off.
+            # The sensor with the largest score among those that explain all others.
             target = int(np.where(is_explained, scores[drive], -np.inf).argmax())
             faults.append(self._fault(target, drive, moments, figures))
         return faults
@@ -251,7 +254,10 @@ class Peers:
 def settle(
     moments: MeanMoments, in_order: BoolArray, label: str, limits: QualityThresholds
 ) -> tuple[Peers, BoolArray]:
-    """Fit peers on sound drives without suspects, until these stay the same; return both."""
+    """Fit peers on the drives that are not suspects, until the suspects stay the same.
+
+    Returns the peers, and the mask of suspects among the drives `in_order`.
+    """
     suspects = ~in_order
     for _ in range(ROUNDS):
         peers = Peers(moments.take(~suspects), label, limits)
@@ -276,26 +282,26 @@ def _quadratic(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
 
 # Labels that contradict those of other drives: sign, factor and zero.
 #
-# In one drive the car, its tyres and the road hide a label that is half as large again. But a
-# mapping or a logger that changes does so for many cars at once: the median over the drives of a
-# day shows what no single drive does. So each drive's label is compared with the prediction by the
-# relation of all drives, and the medians of a day, and of a file, with those of all others.
+# In a single drive, differences of car, tyres and road hide a label that is 50 % too large. But a
+# changed mapping or logger affects many cars at once, so that the median over the drives of a day
+# reveals it. Each drive's label is compared with the prediction by the relation of all drives; the
+# medians of a day, and of a file, are compared with those of all other drives.
 
-# Reversed labels. A few drives with a reversed label are unlike their peers. Among halves, as after
-# a car was logged again with another sign, no drive is usual. But each drive follows one relation
-# between the signals and the label, or its opposite. So signs and relation are estimated in turns:
-# least squares over all drives with their signs, then the sign that agrees with it.
+# Reversed labels. A few drives with a reversed label differ from their peers. If half of the labels
+# are reversed, there is no usual drive. But each drive follows one relation between the signals and
+# the label, or its opposite. So signs and relation are estimated alternately: least squares over
+# all drives with their signs, then the sign of each drive that agrees with it.
 
 SIGN_ROUNDS = 20
 MIN_EXPLAINED = 0.5
-"""Share of the label's variance that the relation must explain, else signs mean nothing."""
+"""Minimum share of the label's variance that the relation explains, to judge signs."""
 
 
 def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> dict[int, Fault]:
     """Return otherwise sound drives whose label contradicts that of the others, with the fault.
 
-    The smaller group is reversed. Of two halves it is the one without the first drive: drives are
-    in the order of their names, which begin with the day.
+    The smaller group is reversed. If both have the same size, it is the group without the first
+    drive: drives are in the order of their names, which begin with the day.
     """
     if label not in table.signals or len(table.signals) < 2 or in_order.sum() < 2:
         return {}
@@ -371,8 +377,8 @@ def find_odd_days(
 ) -> dict[int, Fault]:
     """Return the drives of days or files whose labels are unlike the others', with the fault.
 
-    `groups` are numberings of the drives of the table, such as by day. The most unlike group is
-    removed and the others are compared again. A group of more than half of the drives is usual.
+    `groups` contains arrays with the group of each drive, such as its day. The most different group
+    is removed and the others are compared again. A group of more than half of the drives is usual.
     """
     label = signals.label
     if label not in table.signals or len(table.signals) < 2:
@@ -401,7 +407,7 @@ def find_odd_days(
 
 
 def _figures(drives: MeanMoments, label: int) -> FloatArray | None:
-    """Return offset and gain of each drive's label; None if the others hardly explain labels."""
+    """Return offset and log gain of each drive's label; None if signals hardly explain labels."""
     inputs, with_label, variances = _label_moments(drives, label)
     weights = solve(inputs.sum(axis=0), with_label.sum(axis=0))
     explained, predicted = with_label @ weights, _predicted(inputs, weights)
@@ -468,11 +474,11 @@ def _odd_groups(
                 break
 
 
-# Drives of one car that overlap in time: a car drives once, so that their rows count twice.
+# Drives of one car that overlap in time: their rows count twice.
 
 
 def find_repeated(drives: pa.Table) -> dict[str, Fault]:
-    """Return the fault of each drive during which another one of its car was under way.
+    """Return the fault of each drive that overlaps another drive of its car in time.
 
     `drives` has the columns that `jobs/repeated_drives.sql` reads, a row or more for each drive.
     """

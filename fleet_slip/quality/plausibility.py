@@ -1,6 +1,6 @@
-"""Relations of vehicle dynamics that the rows of a drive contradict: signs, units, delays, swaps.
+"""Checks of a drive's rows by vehicle dynamics: signs, units, delays, swapped signals.
 
-The values are all well formed. Axes and signs are ISO 8855.
+Each value is within its range. Axes and signs are ISO 8855.
 """
 
 import math
@@ -82,10 +82,10 @@ class SoundDrive:
 def check_plausibility(
     catalog: SignalCatalog, signals: Signals, *, from_velocities: bool = False
 ) -> list[Fault]:
-    """Run the checks of a drive's rows; too few rows raise no fault.
+    """Run the checks of a drive's rows; too few rows give no fault.
 
-    Each check passes over signals that an earlier one found faulty. The label of a drive may be
-    computed from its velocities, where its remedies concern these.
+    Each check ignores signals that an earlier check found faulty. `from_velocities` is True if the
+    label is computed from velocities, which changes its remedies.
     """
     label, faults = catalog.label, list(_without_change(catalog, signals))
     sound = SoundDrive(signals, label, np.ones(1, dtype=np.bool_)).without(faults)
@@ -114,10 +114,10 @@ _WHEEL_PAIRS = ({"wheel_fl", "wheel_fr"}, {"wheel_rl", "wheel_rr"})
 
 
 def _with_axes(faults: list[Fault], signals: Signals, label: str) -> list[Fault]:
-    """Return one fault for axes that point down, in place of one for each signal.
+    """Replace the faults of each signal by one fault for axes that point down.
 
-    Then ay and yaw rate are reversed together. With the steering they outvote the wheels, whose
-    columns seem to be swapped at both axles.
+    Such axes reverse ay and yaw rate together. With the steering they outvote the wheels, whose
+    columns then seem to be swapped at both axles.
     """
     reversed_ = {f.signals[0] for f in faults if f.kind == "reversed" and len(f.signals) == 1}
     pairs = [f for f in faults if f.kind == "swapped" and set(f.signals) in _WHEEL_PAIRS]
@@ -148,17 +148,17 @@ def _without_change(catalog: SignalCatalog, signals: Signals) -> Iterator[Fault]
 
 
 # Signals that stay on one side of zero, though the car turns to both sides. Some buses send the
-# magnitude of a rate or an angle, and its sign as a bit of its own.
+# magnitude of a rate or an angle, and its sign as a separate bit.
 
 MIN_ONE_SIDED_S = 60.0
-"""In a shorter drive a car may turn to one side."""
+"""Minimum duration: in a shorter drive a car may turn to one side only."""
 
 
 def find_one_sided(drive: SoundDrive) -> Iterator[Fault]:
     """Yield signals that never change their sign while the car drives; the label comes last.
 
-    A car that does turn to one side, as on an oval, shows it by its rear wheels, or by the mean of
-    the other signs of turning.
+    On an oval a car turns to one side only. The rear wheels, or the means of the other signals,
+    reveal this, and then there is no fault.
     """
     signals, label, moving = drive.signals, drive.label, drive.moving
     rear = ("wheel_rl", "wheel_rr")
@@ -184,7 +184,7 @@ def _mean_ratio(values: FloatArray, rows: BoolArray) -> float:
 
 
 def _side(values: FloatArray, rows: BoolArray) -> int:
-    """Return +1 or -1 for values on one side of zero alone, 0 for others, or too few."""
+    """Return +1 or -1 for values on one side of zero, 0 for both sides or too few values."""
     present = values[np.isfinite(values) & rows]
     if present.size * float(SAMPLE_TIME_S) < MIN_ONE_SIDED_S:
         return 0
@@ -197,7 +197,7 @@ def _side(values: FloatArray, rows: BoolArray) -> int:
 
 
 def _turning(drive: SoundDrive) -> list[Fault]:
-    """Compare the signs of turning, and both accelerations with the turns, while the car moves."""
+    """Compare the signs of turning, and the accelerations with the turns, while the car moves."""
     names = {"ax", *(name for parts in WITNESSES.values() for name in parts)}
     used = {name: values for name, values in drive.signals.items() if name in names}
     if not used:
@@ -213,7 +213,7 @@ def _turning(drive: SoundDrive) -> list[Fault]:
 
 
 def _decide(fault: Fault, drive: SoundDrive) -> Fault:
-    """Return which one of ay and yaw rate contradicts the label, too; the fault if none does."""
+    """Return the fault of ay or yaw rate alone if the label contradicts it, too; else `fault`."""
     drive = replace(drive, speed=speed_mps(drive.signals))
     if not drive.has(drive.label, "yaw_rate", "ay"):
         return fault
@@ -225,14 +225,14 @@ def _decide(fault: Fault, drive: SoundDrive) -> Fault:
     return Fault(fault.kind, (wrong,), figure, "Write negate = true.")
 
 
-# The size of signals by that of others.
+# Sizes of signals, compared with one another.
 
 STEERING_RATIO = 15.0
 ROAD_WHEELS = ("steer_fl", "steer")
 
 
 def _ratio(values: FloatArray, expected: FloatArray, rows: BoolArray) -> float | None:
-    """Return the median of values over expected; None of too few, or where one does not move."""
+    """Return the median ratio of values to expected ones; None for too few or a negative ratio."""
     rows = rows & np.isfinite(values) & np.isfinite(expected) & (expected != 0)
     if rows.sum() < MIN_TICKS:
         return None
@@ -275,7 +275,7 @@ def _turns_at(speed: FloatArray, drive: SoundDrive) -> bool:
 
 
 def _compared(drive: SoundDrive) -> Iterator[tuple[tuple[str, ...], str, float, float]]:
-    """Yield signals, the predictor of the first, its ratio to that, and their correlation."""
+    """Yield signals, the name of the predictor of the first, their ratio, and their correlation."""
     signals, moving, speed = drive.signals, drive.moving, drive.speed
     yaw_rate, ay = signals.get("yaw_rate"), signals.get("ay")
     if yaw_rate is not None and drive.has("wheel_rl", "wheel_rr"):
@@ -298,7 +298,7 @@ def _compared(drive: SoundDrive) -> Iterator[tuple[tuple[str, ...], str, float, 
 
 
 def _sizes(drive: SoundDrive) -> Iterator[Fault]:
-    """Compare the sizes of signals with those that others predict; and the sign of `ax`."""
+    """Compare the sizes of signals with their predictions, and the sign of `ax`."""
     for names, expected, slope, correlation in _compared(drive):
         ratio = slope if correlation > 0 else -slope
         if names == ("ax",) and not CHECKS["sign of ax"].passes(correlation):
@@ -313,7 +313,7 @@ MAX_BEND_MPS, MAX_BEND_MPS2, MIN_BEND_PER_M = 12.0, 6.0, 0.05
 
 
 def _axles(drive: SoundDrive) -> Iterator[Fault]:
-    """Compare axles in tight bends: the front one drives the longer way."""
+    """Compare axles in tight bends: the front axle has the longer path."""
     if not drive.has("yaw_rate", *WHEELS):
         return
     signals, speed, tightness = drive.signals, drive.speed, drive.curvature**2
@@ -330,21 +330,21 @@ def _axles(drive: SoundDrive) -> Iterator[Fault]:
         yield CHECKS["front and rear wheels"].fault(*WHEELS, correlation=correlation)
 
 
-# The label with the motion of the car, within one drive: size, delay, sign, scale and zero.
+# The label and the motion of the car within one drive: size, delay, sign, scale and zero.
 #
-# No other drive is needed, so that a fault of all drives shows.
+# This needs no other drive, so that it also detects a fault of all drives.
 
 FAST_MPS, SLOW_MPS = 8.0, 20.0
-"""Above the first a car hardly has a large angle; below the second it has its lever."""
+"""Above the first speed a car rarely has a large angle; below the second the lever is constant."""
 GENTLE_MPS2, MIN_GENTLE_TICKS = 5.0, 500
-"""Beyond, a tyre slips more than in proportion: a race car at its limit shows no lever."""
+"""Maximum ay, and minimum ticks below it: beyond, tyres are not linear, so there is no lever."""
 MAX_COLLINEARITY = 0.995
-"""Correlation of curvature and curvature times squared speed. Below, speeds differ by 5 % and more.
-At one speed ay and curvature differ by phase alone, and relaxing tyres bias the lever."""
+"""Maximum correlation of curvature and curvature times squared speed: below it, speeds differ by at
+least 5 %. At one speed ay and curvature differ only in phase, and relaxing tyres bias the lever."""
 SLIDING_M, SLIDING_RAD = 8.0, 0.15
-"""No car's rear axle is so far behind; a car that often slips so much slides."""
+"""Lever beyond that of any car, and the angle of a sliding car if it is frequent."""
 MIN_EXPLAINED, MIN_SURE_EXPLAINED = 0.6, 0.85
-"""Share of the variance that shows a sign, and one that shows a scale and a zero."""
+"""Explained share of the variance to judge the sign, and to judge scale and zero."""
 WHEELBASE_M, MAX_WHEELBASE_SHARE = (2.0, 4.5), 0.75
 """Wheelbases of cars, and the largest share of it between centre of gravity and rear axle."""
 MAX_COMPLIANCE = 0.012
@@ -381,7 +381,7 @@ def _contradictions(drive: SoundDrive) -> Iterator[tuple[str, Mapping[str, float
 
 
 def _gentle(drive: SoundDrive) -> BoolArray:
-    """Return where the car turns gently and slowly, or not at all."""
+    """Return a mask of rows in which the car turns gently and slowly, or not at all."""
     signals, speed = drive.signals, drive.speed
     slow = (speed < SLOW_MPS) & (speed > 0) & (np.abs(signals["ay"]) < GENTLE_MPS2)
     return drive.moving & slow & np.isfinite(signals["yaw_rate"])
@@ -390,7 +390,7 @@ def _gentle(drive: SoundDrive) -> BoolArray:
 def _fit_lever(angle: FloatArray, drive: SoundDrive) -> tuple[float, float, float]:
     """Return the slope on the curvature in m, the constant and the explained share.
 
-    The curvature has no effect on ay of its own: both are inputs. All are 0 at one speed.
+    The inputs are curvature and ay. All results are 0 if the drive has only one speed.
     """
     rows, inputs = _gentle(drive), np.array([drive.curvature, drive.signals["ay"]])
     if rows.sum() < MIN_GENTLE_TICKS or _is_one_speed(inputs[0, rows], drive.speed[rows]):
@@ -400,7 +400,7 @@ def _fit_lever(angle: FloatArray, drive: SoundDrive) -> tuple[float, float, floa
 
 
 def _is_one_speed(curvature: FloatArray, speed: FloatArray) -> bool:
-    """Return True if the speed differs too little to part curvature and ay."""
+    """Return True if the speed varies too little to separate curvature and ay."""
     squared = curvature * speed**2
     if not (curvature.std() > 0 and squared.std() > 0):
         return True
@@ -408,7 +408,7 @@ def _is_one_speed(curvature: FloatArray, speed: FloatArray) -> bool:
 
 
 def _lever(drive: SoundDrive, *, sliding: bool) -> Iterator[tuple[str, Mapping[str, float]]]:
-    """Compare the label's slope on the curvature with the places of rear axles, and its zero."""
+    """Compare the label's slope on the curvature with the levers of cars, and check its zero."""
     lever_m, zero, explained = _fit_lever(drive.signals[drive.label], drive)
     check, sign = CHECKS["scale of the label"], CHECKS["sign of the label"]
     low, high = check.low, check.high
@@ -435,7 +435,7 @@ def _lever(drive: SoundDrive, *, sliding: bool) -> Iterator[tuple[str, Mapping[s
 
 
 def _wheelbase_m(drive: SoundDrive) -> float:
-    """Return the wheelbase that the road wheels show, infinity if they show none."""
+    """Return the wheelbase by the steering of the road wheels; infinity if it is unclear."""
     angle = next((drive.signals[name] for name in ROAD_WHEELS if drive.has(name)), None)
     if angle is None:
         return math.inf
@@ -460,7 +460,7 @@ def _fit_one_speed(drive: SoundDrive) -> tuple[float, float, float]:
 # The checks of rows on some long drives of a cohort, read from the logs.
 
 MAX_TICKS = 100_000
-"""Ticks of each drive that are read: a quarter of an hour."""
+"""Maximum ticks to read of each drive: a quarter of an hour."""
 
 _LONGEST = """
     SELECT drive_id, vehicle_id, day FROM drives WHERE source = $source AND ({predicate})
@@ -486,7 +486,7 @@ class Inspection:
     Attributes
     ----------
     drives
-        One of each car first, the longest first.
+        The longest drive of each car first, then the second longest, and so on.
     measured
         Number of measured drives of the cohort.
     """

@@ -129,7 +129,7 @@ class AppTransaction:
 
 @dataclass(frozen=True)
 class Change:
-    """Content of a commit. A file that is added and removed stays.
+    """Content of a commit. A file that is both added and removed remains in the table.
 
     `data_change` is False if rows only move between files.
     """
@@ -406,7 +406,8 @@ class Snapshot:
         from deltalake import CommitProperties, Transaction
 
         table, actions = self.table, change.actions()
-        note = checked_note(change.note, actions, {u.name: u.version for u in change.transactions})
+        versions = {transaction.name: transaction.version for transaction in change.transactions}
+        note = checked_note(change.note, actions, versions)
         with table.committing():
             delta = self.delta or table.create()
             added = (json.loads(action.stats)["nullCount"] for action in change.add)
@@ -418,7 +419,10 @@ class Snapshot:
                 partition_by=list(table.partition_by),
                 commit_properties=CommitProperties(
                     custom_metadata={NOTE: note},
-                    app_transactions=[Transaction(u.name, u.version) for u in change.transactions],
+                    app_transactions=[
+                        Transaction(transaction.name, transaction.version)
+                        for transaction in change.transactions
+                    ],
                 ),
             )
             table.folder.settle_commits(self.version)
@@ -454,7 +458,7 @@ class Table:
     _newest: dict[object, Snapshot] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
-    """The newest snapshot by its stamp: to open it takes milliseconds, a look for commits not."""
+    """The newest snapshot by its stamp. Opening a snapshot takes longer than testing the stamp."""
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle without the newest snapshot."""
@@ -468,16 +472,16 @@ class Table:
 
         return pa.schema([field for field in self.schema if field.name not in self.optional])
 
-    def snapshot(self, version: int | None = None, *, anew: bool = False) -> Snapshot:
+    def snapshot(self, version: int | None = None, *, reload: bool = False) -> Snapshot:
         """Return the newest version, or a given one; empty if unwritten. Raises `StorageError`.
 
-        Returns the same snapshot while nobody commits. `anew` reads the whole log instead, which
+        Returns the same snapshot while nobody commits. `reload` reads the whole log instead, which
         detects later damage.
         """
         if version is not None:
             return Snapshot(self, self.open_delta(version))
         for stamp, opened in list(self._newest.items()):
-            if not anew and _stamp(opened) == stamp:
+            if not reload and _stamp(opened) == stamp:
                 return opened
         delta = self.open_delta()
         if delta is not None:
@@ -559,11 +563,12 @@ class Table:
     def discard(self, actions: Iterable[AddAction]) -> None:
         """Delete files that this process wrote and could not commit.
 
-        Reads the log first: a commit whose answer was lost conflicts with itself.
+        Reads the log first: if the response to a commit was lost, its repetition is a conflict, but
+        the files are committed.
         """
-        landed = {file.path for file in Snapshot(self, self.open_delta()).files}
+        committed = {file.path for file in Snapshot(self, self.open_delta()).files}
         for action in actions:
-            if action.path not in landed:
+            if action.path not in committed:
                 self.folder.delete(action.path)
 
     def encode(self, rows: pa.Table) -> Encoded:

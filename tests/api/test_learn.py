@@ -13,8 +13,8 @@ from fleet_slip.ingest.columns import SignalColumn
 from fleet_slip.ingest.mapping import (
     Mapping,
     assumptions_of,
-    keep_assumptions,
     load_mapping,
+    store_assumptions,
 )
 from fleet_slip.storage.local import LocalFolder
 from tests.support.catalog import CATALOG
@@ -101,7 +101,7 @@ def test_evaluate_lists_a_speed_that_replaces_the_wheels(
     mapping = load_mapping(str(folder / "own.toml"), CATALOG)
     speed = SignalColumn(column="v", unit="km/h")
     signals = {**mapping.signals, "wheel_fl": speed, "wheel_fr": speed}
-    keep_assumptions(LocalFolder(root), mapping.model_copy(update={"signals": signals}))
+    store_assumptions(LocalFolder(root), mapping.model_copy(update={"signals": signals}))
     done = run_on(root, "evaluate", "golf", "--cohort", "source = 'measured'")
     assert "assumed: one speed of the car replaces the wheel speeds" in done.stderr
     assert "side-slip sensor" not in done.stderr

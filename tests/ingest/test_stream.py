@@ -105,7 +105,7 @@ def test_stored_rows_do_not_depend_on_the_size_of_data_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, files: int
 ) -> None:
     monkeypatch.setattr(logs, "FILE_ROWS", limit)
-    monkeypatch.setattr(measured_log, "REFUSED_ROWS", limit)
+    monkeypatch.setattr(measured_log, "MAX_REJECTED_IN_MEMORY", limit)
     columns = good_columns(90)
     columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(90)]
     columns["ax"][3] = columns["ax"][70] = "x"

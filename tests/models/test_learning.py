@@ -127,7 +127,7 @@ def test_a_version_is_the_same_on_board(fleet: Fleet) -> None:
     estimate = manifest.definitions["line"].made
     assert isinstance(estimate, Combination)
     assert (estimate.terms, estimate.line) == (line.fitted.terms, line.digest)
-    assert manifest.line == line.digest
+    assert manifest.first_stage_digest == line.digest
     program = compile_program(fleet.warehouse.catalog, manifest)
     for check in make_checks(fleet.warehouse.catalog, manifest, program):
         content, samples = program_content(program), list(check.samples)

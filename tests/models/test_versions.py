@@ -208,6 +208,6 @@ def test_hashes_of_drives_are_those_of_versions_of_before() -> None:
     trained = TrainedDrives.from_hashes("year", drives)
     assert trained.salted.tolist() == expected
     assert trained.content == b"".join(number.to_bytes(8, "big") for number in expected)
-    assert TrainedDrives.unpacked("year", trained.content).among(drives).all()
+    assert TrainedDrives.from_content("year", trained.content).among(drives).all()
     assert not len(TrainedDrives.from_hashes("year", drives[:0]).salted)
     assert TrainedDrives.from_hashes("other", drives).salted.tolist() != expected

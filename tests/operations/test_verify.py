@@ -320,7 +320,7 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 @JOBS
-@pytest.mark.parametrize("moment", ["by_sql", "stored_grams", "wide_grams"])
+@pytest.mark.parametrize("moment", ["by_sql", "stored_grams", "by_kernel"])
 def test_a_check_beside_a_job_that_takes_files_away_finds_no_damage(
     job: Callable[[Warehouse], Any], moment: str, three: Warehouse, meanwhile: Callable[..., None]
 ) -> None:
@@ -345,7 +345,7 @@ def test_damage_is_damage_beside_other_jobs_too(
     rng = np.random.default_rng(1)
     meanwhile(
         verification,
-        "wide_grams",
+        "by_kernel",
         lambda: land(three, "more", log_rows("x", random_counts(rng, 9))),
     )
     with pytest.raises(StorageError, match=removed.path.rpartition("/")[2]):
@@ -360,6 +360,6 @@ def test_a_check_of_tables_that_never_rest_ends(
         three.grams.fence()
         raise StorageError("a file is gone")
 
-    meanwhile(verification, "wide_grams", spoil, once=False)
+    meanwhile(verification, "by_kernel", spoil, once=False)
     with pytest.raises(StorageError, match="a file is gone"):
         check_grams(three, 3)

@@ -2,8 +2,8 @@
 
 Each message is a time base, a column is `Message.Signal`. Error frames and remote requests are
 skipped. A value with a name in the database, such as `SNA`, is null. A signal whose names are
-states, such as P, R, N, D, is these names, and null without one; as a signal of a mapping it is a
-number.
+states, such as P, R, N, D, becomes these names, and null without one; a signal of a mapping becomes
+a number.
 
 Start bit, byte order and multiplexing are those of the DBC format, as cantools parses it. The tests
 compare with its decoder, which takes one frame at a time.
@@ -59,7 +59,7 @@ def is_possible(signal: Any) -> bool:
 
 
 def needed_bytes(signal: Any) -> int:
-    """Return how long a payload must be to hold a signal."""
+    """Return the minimum number of bytes of a payload with a signal."""
     return max(byte for byte, _ in _bits(signal)) + 1
 
 
@@ -90,7 +90,7 @@ def physical(signal: Any, raw: NDArray[Any]) -> FloatArray:
 
 
 def with_multiplexers(message: Any, signal: Any) -> list[Any]:
-    """Return a signal, the one that selects it if it is multiplexed, that one's, and so on."""
+    """Return a signal, its multiplexer if it has one, the multiplexer of that, and so on."""
     chain = [signal]
     while chain[-1].multiplexer_ids is not None:
         chain.append(message.get_signal_by_name(chain[-1].multiplexer_signal))
@@ -98,7 +98,7 @@ def with_multiplexers(message: Any, signal: Any) -> list[Any]:
 
 
 def is_sent(message: Any, signal: Any, payloads: Bytes) -> BoolArray:
-    """Return in which frames a multiplexed signal is; in all, if it is not multiplexed."""
+    """Return a mask of the frames with a signal: all frames if it is not multiplexed."""
     sent = np.ones(len(payloads), dtype=np.bool_)
     for selected, selector in pairwise(with_multiplexers(message, signal)):
         sent &= np.isin(raw_integers(selector, payloads), list(selected.multiplexer_ids))
@@ -253,7 +253,7 @@ def _refuse_unknown(record: logging.LogRecord) -> bool:
 def _tables(trace: Iterable[Any], start_s: float, bus_offset: int) -> Iterator[Frames]:
     """Yield the frames with data, some at once.
 
-    python-can counts the buses of ASC and BLF from 0, they from 1.
+    The buses of ASC and BLF are numbered from 1, those of python-can from 0.
     """
     sent = (frame for frame in trace if not (frame.is_error_frame or frame.is_remote_frame))
     while frames := list(islice(sent, AT_ONCE)):

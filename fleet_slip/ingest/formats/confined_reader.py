@@ -6,7 +6,7 @@ is two sizes, JSON, and rows as an Arrow stream. The caller limits the sum of te
 
 A reader can read that file, a folder for its temporary files, and the installed code, which
 libraries import late. It cannot connect, start programs or processes, or signal, slow or limit
-others. Where the kernel has no Landlock (before 5.13, or disabled) other files stay readable.
+others. Without Landlock (a kernel before 5.13, or disabled) other files stay readable.
 """
 
 import contextlib
@@ -67,7 +67,7 @@ FORMATS = {
 }
 """Each has `open_FORMAT` in its module."""
 SIZES, ROWS = struct.Struct("<QQ"), b'["rows", '
-"""How an answer begins, and the question for rows."""
+"""Header of an answer, and beginning of the question for rows."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd"}
 
 
 def decompressed(stream: BinaryIO) -> BinaryIO:
-    """Return the text of a stream, whatever it is compressed with."""
+    """Return the text of a stream, decompressed if necessary."""
     start = stream.read(max(map(len, COMPRESSED)))
     stream.seek(0)
     for magic, codec in COMPRESSED.items():
@@ -37,7 +37,7 @@ def decompressed(stream: BinaryIO) -> BinaryIO:
 
 
 def text_of(stream: BinaryIO, csv_format: CsvFormat) -> BinaryIO:
-    """Return the text of a stream as UTF-8, whatever it is compressed with."""
+    """Return the text of a stream as UTF-8, decompressed if necessary."""
     plain = decompressed(stream)
     if csv_format.encoding == "utf-8":
         return plain
@@ -46,7 +46,7 @@ def text_of(stream: BinaryIO, csv_format: CsvFormat) -> BinaryIO:
 
 
 def first_lines(file: Path, csv_format: CsvFormat, count: int) -> list[str]:
-    """Return the first lines of a text file, whatever it is compressed with."""
+    """Return the first lines of a text file, decompressed if necessary."""
     with file.open("rb") as stream:
         text = text_of(stream, csv_format)
         lines = iter(lambda: text.readline(MAX_LINE_BYTES), b"")
@@ -57,13 +57,13 @@ BLOCK_BYTES = 2**22
 """CSV is parsed in blocks of about this size."""
 
 LINE_BLOCKS = 4
-"""Blocks that one line may fill. Where it fills more, usually a quote was not closed."""
+"""Maximum number of blocks of one line. A longer line usually has a quote that is not closed."""
 
 EXTRA_FIELDS = "\0extra fields"
-"""Column of a CSV batch: the text of a line after the header's last column, null if none."""
+"""Column of a CSV batch: the text of a line after the last column of the header, or null."""
 
 CUT = "the file ends within this line"
-"""Its value for a last line that is cut: without a line break, with fewer fields than others."""
+"""Value of `EXTRA_FIELDS` for a last line without a line break and with fewer fields."""
 
 FEWER = "fewer fields than names"
 """Value of `EXTRA_FIELDS` for a line with too few fields, in formats without empty fields."""
@@ -114,7 +114,7 @@ class CsvSource(Source):
     def read(self, _base: str, places: dict[str, int]) -> Iterator[pl.DataFrame]:
         """Yield the columns as text or plain numbers, and `EXTRA_FIELDS`.
 
-        A line that repeats the header, in any order, gives the places of the columns behind it.
+        A line that repeats the header, in any order, defines the columns of the lines after it.
         """
         with self._budget.file.open("rb") as stream:
             plain = text_of(stream, self.csv_format)
@@ -165,7 +165,7 @@ class CsvSource(Source):
     def _require_fields(self, lines: bytes, names: list[str]) -> None:
         """Raise `InputError` if all first rows have fewer fields than there are names.
 
-        Nothing shows then which of the columns is not there.
+        Then the missing columns are unknown.
         """
         rows = [row for row in lines.split(b"\n", _FIRST_ROWS)[:_FIRST_ROWS] if row.strip()]
         separator = self.csv_format.separator.encode()
@@ -204,8 +204,8 @@ class CsvSource(Source):
         Columns are read by position: Polars renames doubles. A line of separators before them fixes
         the number of fields, and keeps a block from looking like a compressed file.
         """
-        # Reading on over bad numbers is reading on over bad quotes. Beside a decimal comma a point
-        # groups digits, but Polars reads it as one.
+        # `ignore_errors` would also ignore bad quotes. With a decimal comma a point groups digits,
+        # but Polars reads it as a decimal point.
         grouped = self.csv_format.decimal_comma and b"." in block
         parsed_numbers = set[str]() if b'"' in block or grouped else numbers
         padding = self.csv_format.separator.encode() * width + b"\n"
@@ -243,7 +243,7 @@ def described(fields: Sequence[str]) -> list[Channel]:
 
 
 _NUMBER = re.compile(r"[-+\d.,eE ]*")
-"""A name that may also be a value of a row."""
+"""Pattern of names that may also be values of a row."""
 
 
 def _fields(line: str, csv_format: CsvFormat) -> list[str] | None:
@@ -259,7 +259,7 @@ def _fields(line: str, csv_format: CsvFormat) -> list[str] | None:
 
 
 def _end_of_lines(block: bytes) -> int:
-    """Return where the last whole line ends: behind a line break with no open quote before it."""
+    """Return the end of the last whole line, after a line break outside of quotes."""
     end = block.rfind(b"\n") + 1
     quotes = block.count(b'"', 0, end)
     while quotes % 2:

@@ -42,7 +42,7 @@ _COUNTS = (
     "again with physical values."
 )
 WINDOW_ROWS = 2**17
-"""Rows that are read at once: for each time npTDMS reads all that a segment has of a channel."""
+"""Rows of a batch: for each batch npTDMS reads all values of a channel in a segment."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Vectors(Source):
     """The vectors of an open file. Time is one of them, except of waveforms."""
 
     def __init__(self, budget: Budget) -> None:
-        """Begin without vectors, by name, and without reasons why others are not read."""
+        """Begin without vectors and without refused ones; both are by name."""
         self._budget = budget
         self.vectors: dict[str, Vector] = {}
         self.refused: dict[str, str] = {}
@@ -176,9 +176,8 @@ def open_mat(budget: Budget, _formats: FileFormats) -> Iterator[Vectors]:
 def _open_hdf5(budget: Budget) -> Iterator[Vectors]:
     """Open a MATLAB file of version 7.3, or any HDF5 file. Raises `InputError`.
 
-    HDF5 can take the values of a dataset out of any other file. That is asked of each dataset
-    before anything else, its size among it: the library opens those files for it. Links are
-    not followed.
+    A dataset of HDF5 can refer to values in any other file. This is tested first for each dataset:
+    the library opens those files even for the size. Links are not followed.
     """
     h5py = load_library(budget.file, "h5py")
     content = Vectors(budget)

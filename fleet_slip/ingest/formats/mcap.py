@@ -69,7 +69,7 @@ def _decoder_of(channel: Any, schema: Any) -> Decode | None:
         return None
 
     def decode_plain(data: bytes) -> Any:
-        # The decoder reads any other as this one too, with its numbers at wrong places.
+        # The decoder would read other encodings as this one, with wrong numbers.
         if data[:2] not in {b"\0\0", b"\0\1"}:
             raise ValueError(f"a message is not plain CDR (it begins with {data[:2].hex()})")
         return decode(data)

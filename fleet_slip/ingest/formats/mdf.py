@@ -32,10 +32,9 @@ from fleet_slip.ingest.formats.source import (
 
 # Applies the conversions of an MDF file, of counts to physical values.
 #
-# asammdf hands the formula of a stranger to sympy, which runs it, and where it cannot it leaves the
-# counts. So it is asked for raw values only, and for the arithmetic that has no formula; formulas
-# are refused. It also rounds the bounds of ranges, and matches other rows in a long block than in a
-# short one.
+# asammdf passes a formula of the file to sympy, which executes it; if that fails, it returns the
+# counts. So this module requests raw values and conversions without a formula; formulas are
+# refused. asammdf also rounds the bounds of ranges, and the length of a block changes its result.
 
 _KINDS = {
     b"##CC": dict(enumerate(
@@ -262,7 +261,7 @@ class MdfSource(Source):
             ) from None
 
     def _release(self) -> None:
-        """Let the system have back the pages of the file, or all of it counts as our memory."""
+        """Release the pages of the file: mapped pages would count as memory of this process."""
         mapped = self._mdf._mdf._file
         # The copy of an unfinalised file has changes that are in memory only.
         if isinstance(mapped, mmap.mmap) and memoryview(mapped).readonly:
@@ -367,8 +366,8 @@ def _start_s(header: Any, zone: str | None) -> float:
 def open_mdf(budget: Budget, formats: FileFormats) -> Iterator[MdfSource]:
     """Open an MDF file. Raises `InputError`.
 
-    An attachment may be any other file, and so may the database by which asammdf would decode bus
-    logging at once: nothing is read of either.
+    An attachment may be any other file, and so may the database for decoding bus logging: neither
+    is read.
     """
     mdf = load_library(budget.file, "asammdf").MDF(
         budget.file, temporary_folder=tempfile.gettempdir(), process_bus_logging=False

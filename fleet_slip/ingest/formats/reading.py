@@ -46,7 +46,7 @@ SUFFIXES = (
 BEGINNINGS = (MAGIC, *(start for kind in FORMATS.values() for start in kind.begins))
 """First bytes of binary logs, whatever their suffix: INCA calls MDF files `.dat`."""
 _HDF5_AT = 512
-"""A MATLAB file of version 7.3 becomes HDF5 there: MATLAB's own header is before it."""
+"""Offset of HDF5 in a MATLAB file of version 7.3, after MATLAB's own header."""
 _ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
 
 
@@ -138,8 +138,8 @@ _ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": "1000000000",
     "TZ": "UTC",
 }
-"""Else libraries reserve memory for threads that a reader does not need. Clocks without a zone are
-in UTC, so that the result does not depend on the zone of this machine."""
+"""Limits the memory that libraries reserve for threads. Clocks without a zone are in UTC, so that
+the result does not depend on the zone of this machine."""
 _INHERITED = ("LD_LIBRARY_PATH",)
 _POLL_S = 0.1
 """Interval in s at which the sum of a reader's temporary files is measured."""
@@ -252,7 +252,7 @@ class ConfinedSource(Source):
         raise (kind if is_ours else InputError)(str(answer.get("text")))
 
     def _receive(self, size: int, until_s: float) -> bytearray:
-        """Receive so many bytes. Raises `InputError` if they do not come in time."""
+        """Receive `size` bytes. Raises `InputError` if they do not arrive in time."""
         received = bytearray(size)
         remaining = memoryview(received)
         while remaining:
@@ -271,9 +271,9 @@ class ConfinedSource(Source):
         return received
 
     def _require_disk(self) -> None:
-        """Raise `InputError` if the reader's temporary files are larger together than one may be.
+        """Raise `InputError` if the reader's temporary files together exceed the limit of one file.
 
-        A file that it has deleted and holds open counts too.
+        A deleted file that it holds open counts too.
         """
         if _written_bytes(self._folder, self._handle) > self._budget.unfolded:
             raise self._budget.crashed()
@@ -307,6 +307,6 @@ def open_confined(name: str, budget: Budget, formats: FileFormats) -> Iterator[S
         finally:
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(handle, signal.SIGKILL)
-            select.select([handle], [], [])  # until it is gone, and its locks
+            select.select([handle], [], [])  # until it has ended and released its locks
             os.close(handle)
             channel.close()

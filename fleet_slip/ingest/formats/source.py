@@ -27,16 +27,16 @@ from fleet_slip.base import quote_name, require_extra
 from fleet_slip.errors import InputError, MissingColumnError
 
 OWN_TIME = "\0time"
-"""Column of times in s, where the file has clocks of its own."""
+"""Column of times in s, in files with clocks."""
 BASE = "\0base"
 """Column with the number of a row's time base, if there are several."""
 
 EARLIEST_S = 10**8
-"""A start before 1973 is no date: of loggers without a clock it is 0, of LabVIEW 1904."""
+"""Earliest start that is a date, in 1973: loggers without a clock state 0, LabVIEW states 1904."""
 
 
 def clock_start_s(start: datetime, zone: str | None) -> float:
-    """Return the start of a clock in s since 1970, 0 if it is no date.
+    """Return the start of a clock in s since 1970, 0 without a date.
 
     A start without a time zone is in `zone`, else in UTC.
     """
@@ -64,7 +64,7 @@ class Channel:
     base
         Its time base; channels of one base form a table.
     title
-        Its meaning, where the format defines that by the name.
+        Its meaning, if the format defines it by the name.
     """
 
     name: str
@@ -99,11 +99,12 @@ class Source(ABC):
         raise NotImplementedError
 
     def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
-        """Return the rows of each time base that has one of the columns; without a clock of one.
+        """Return the rows of each time base that has one of the columns.
 
-        They come in the file's order, in bounded batches, at least one, with the columns of their
-        base as text, 64-bit floats or integers, dates or timestamps, and `OWN_TIME` with a clock.
-        Raises `InputError`, for a missing or ambiguous column too.
+        A file without a clock has one base. The rows are in the file's order, in one or more
+        bounded batches. Columns are text, 64-bit floats or integers, dates or timestamps; with a
+        clock, `OWN_TIME` is one of them. Raises `InputError`, also for a missing or ambiguous
+        column.
         """
         places_by_base: dict[str, dict[str, Any]] = {}
         for column in columns:
@@ -126,7 +127,7 @@ def load_library(file: Path, package: str) -> Any:
 
 
 def unreadable(file: object, error: BaseException) -> InputError:
-    """Return the error of a file at which a library raised another one."""
+    """Return the error of a file for which a library raised `error`."""
     reason = quote_name(str(error).strip().split("\n")[0][:200]) or type(error).__name__
     return InputError(
         f"{quote_name(file)}: cannot be read: {reason}. Is it complete? Copy it again, or export "
@@ -164,7 +165,7 @@ _NO_STATE = re.compile(
     r"|unknown|default|nicht.?verf|ung(ue|ü)ltig|fehler|signal_?ung",
     re.IGNORECASE,
 )
-"""Names in databases of values that mean a missing value."""
+"""Pattern of value names in databases that mean a missing value."""
 
 
 def names_states(texts: Iterable[str]) -> bool:
@@ -217,17 +218,17 @@ def missing_column(file: object, column: str, names: Sequence[str]) -> MissingCo
     )
 
 
-# A small file can stand for anything. What it may become while it is decoded follows from its size
-# alone; a log that was measured is far below, since noise cannot be packed.
+# A small compressed file can decode to any size. The limits of decoding depend only on the size of
+# the file. A measured log is far below them, since noise hardly compresses.
 
 FREE_ROWS, ROWS_PER_BYTE = 10**6, 4
-"""Rows that any file may have, and rows for each of its bytes if those are more."""
+"""Maximum rows of any file, and rows for each of its bytes if these are more."""
 FREE_BYTES, BYTES_PER_BYTE = 2**30, 200
-"""The same for the bytes that it unfolds to."""
+"""Maximum bytes after decompression: of any file, and for each of its bytes."""
 FREE_MEMORY, MEMORY_PER_BYTE = 2**30, 8
-"""Memory that any reader of other people's may take, and more for each byte of its file."""
+"""Maximum memory of a reader in bytes, and additional memory for each byte of its file."""
 FREE_S, BYTES_PER_S = 60.0, 10**5
-"""Seconds in which any file must be decoded, and a speed that no format falls below."""
+"""Maximum time to decode any file, in s, and the minimum speed of larger files."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +276,7 @@ class Budget:
             raise self.exceeded(f"it decompresses to more than {self.unfolded:,} bytes")
 
     def crashed(self) -> InputError:
-        """Return the error of a file whose reader ended, sends nonsense, or needs too much."""
+        """Return the error of a file whose reader ended, is invalid, or exceeds its limits."""
         return self.exceeded(
             f"its reader crashed, or needs more than {self.memory:,} bytes, or {self.unfolded:,} "
             "in a temporary file"
@@ -286,7 +287,7 @@ class Budget:
         return self.exceeded(f"decoding it took more than {self.seconds:,.0f} s")
 
     def exceeded(self, problem: str) -> InputError:
-        """Return the error of a file that is too much for its size."""
+        """Return the error of a file that exceeds a limit for its size."""
         return self.error(
             f"{problem}, the limit for its {self.size:,} bytes. Is it damaged? If it is a real "
             "recording, export it as uncompressed CSV."
@@ -297,7 +298,7 @@ class Budget:
         return InputError(f"{quote_name(self.file)}: {text}")
 
     def metered(self, batches: Iterator[pl.DataFrame]) -> Iterator[pl.DataFrame]:
-        """Yield batches while rows and seconds last; the caller's own time does not count."""
+        """Yield batches within the limits of rows and time; the caller's time does not count."""
         rows, seconds = 0, 0.0
         while True:
             began = time.monotonic()
@@ -313,14 +314,14 @@ class Budget:
 
 
 IN_MEMORY_BYTES = 2**24
-"""Up to this size all is in memory, and there is no file."""
+"""Maximum size in memory; a larger spool is a temporary file."""
 
 
 class Spool:
     """Pieces of bytes by key, in their order, beyond 16 MiB in a temporary file without a name."""
 
     def __init__(self) -> None:
-        """Begin without any."""
+        """Begin without pieces."""
         self._file = tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES)  # noqa: SIM115 - as long as this
         self._pieces: dict[Hashable, list[tuple[int, int]]] = defaultdict(list)
         self._end = 0

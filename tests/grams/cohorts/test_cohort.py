@@ -6,7 +6,7 @@ import pytest
 
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import (
-    FULL,
+    FULL_WEIGHT,
     MAX_LOST_SHARE,
     Cohort,
     DriveWeights,
@@ -130,7 +130,9 @@ def fitted(table: GramTable, weights: DriveWeights) -> np.ndarray:
 
 def test_honest_drives_keep_all_of_their_weight() -> None:
     for seed in range(20):
-        assert (robust_weights(DriveMoments.from_table(drives_of(seed, {}))).weights == FULL).all()
+        assert (
+            robust_weights(DriveMoments.from_table(drives_of(seed, {}))).weights == FULL_WEIGHT
+        ).all()
 
 
 def test_lost_drives_count_next_to_nothing() -> None:
@@ -138,19 +140,19 @@ def test_lost_drives_count_next_to_nothing() -> None:
     for seed in range(10):
         table = drives_of(seed, {3: -1.0, 17: 4.0})
         weights = robust_weights(DriveMoments.from_table(table))
-        assert set(np.flatnonzero(weights.weights < FULL).tolist()) == {3, 17}
+        assert set(np.flatnonzero(weights.weights < FULL_WEIGHT).tolist()) == {3, 17}
         assert weights.weights[[3, 17]].max() <= 2
-        expected_weights = np.where(np.isin(np.arange(40), [3, 17]), 0, FULL)
+        expected_weights = np.where(np.isin(np.arange(40), [3, 17]), 0, FULL_WEIGHT)
         coefficients = fitted(table, DriveWeights(expected_weights, weights.times))
         assert fitted(table, weights) == pytest.approx(coefficients, abs=0.012)
-        everything = fitted(table, DriveWeights(np.full(40, FULL), weights.times))
+        everything = fitted(table, DriveWeights(np.full(40, FULL_WEIGHT), weights.times))
         assert np.abs(everything - TRUE).max() > 3 * np.abs(fitted(table, weights) - TRUE).max()
 
 
 def test_no_more_than_a_tenth_of_the_weight_is_lost() -> None:
     table = drives_of(1, dict.fromkeys(range(8), 3.0))
     weights = robust_weights(DriveMoments.from_table(table))
-    lost = (table.n * (FULL - weights.weights)).sum() / (FULL * table.n.sum())
+    lost = (table.n * (FULL_WEIGHT - weights.weights)).sum() / (FULL_WEIGHT * table.n.sum())
     assert 0 < lost <= MAX_LOST_SHARE
 
 
@@ -169,5 +171,5 @@ def test_integers_beyond_64_bits_stay_exact() -> None:
     table = drives_of(5, {}, drives=2)
     large = GramTable(table.signals, table.n, table.sums, table.products * 2**34)
     expected = large.total()
-    gram = weighted(large, np.array([FULL, FULL])).total()
-    assert gram.products == tuple(FULL * product for product in expected.products)
+    gram = weighted(large, np.array([FULL_WEIGHT, FULL_WEIGHT])).total()
+    assert gram.products == tuple(FULL_WEIGHT * product for product in expected.products)

@@ -14,7 +14,7 @@ import pytest
 
 from fleet_slip.catalog.course import MAX_CHANGE_RAD, TURNED, course_units
 from fleet_slip.columns.drive_columns import ColumnPlan
-from fleet_slip.grams.compute import Fixes, aggregate, counts_of, wide_grams
+from fleet_slip.grams.compute import Fixes, aggregate, by_kernel, counts_of
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS, configs_with
@@ -92,7 +92,7 @@ def test_gram_rows_of_several_times_are_sums_of_the_plain_changes(
 def test_a_log_without_a_course_has_no_changes(warehouse: Warehouse) -> None:
     table = hostile_drive("a", 1000, 1)
     land(warehouse, "one", table.drop_columns(["course", "satellite_speed"]))
-    rows = wide_grams(warehouse, warehouse.logs.snapshot().files, "course")
+    rows = by_kernel(warehouse, warehouse.logs.snapshot().files, "course")
     assert (rows["n"].to_pylist(), rows["signals"].to_pylist()) == ([1], [""])
 
 

@@ -22,7 +22,7 @@ from fleet_slip.catalog.definitions import (
 from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.columns.drive_columns import BLOCK_ROWS, ColumnPlan, DriveCounts, compute_columns
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.compute import aggregate, by_sql, gram_statement, wide_grams
+from fleet_slip.grams.compute import aggregate, by_kernel, by_sql, gram_statement
 from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.verify import grams_of
 from fleet_slip.regression.gram import Gram
@@ -204,7 +204,7 @@ def test_gram_rows_of_the_kernel_are_those_of_the_statement(
     land(warehouse, "one", hostile_drive("b", 400, 1), hostile_drive("a", 2, 2).slice(0, 1), rows)
     land(warehouse, "two", hostile_drive("c", 5000, 4, null=0.001))
     files = warehouse.logs.snapshot().files
-    kernel = wide_grams(warehouse, files, feature_set)
+    kernel = by_kernel(warehouse, files, feature_set)
     defined = by_sql(warehouse, files, feature_set).cast(kernel.schema)
     assert kernel.num_rows > 8
     assert sum(kernel["n"].to_pylist()) == 6101
@@ -223,7 +223,7 @@ def test_blocks_of_time_divide_the_gram_row_of_a_whole_drive(warehouse: Warehous
     columns = ("ay_mean_16", "curvature_mean_64", "sideslip")
     sums = []
     for feature_set in ("blocks", "windows"):
-        rows = wide_grams(warehouse, files, feature_set)
+        rows = by_kernel(warehouse, files, feature_set)
         totals = dict.fromkeys(("a", "b"), Gram.zero(columns))
         for (name, signals), gram in grams_of(rows).items():
             if set(columns) <= set(signals):
@@ -253,11 +253,11 @@ def test_the_order_of_rows_in_a_file_does_not_matter(warehouse: Warehouse) -> No
     table = pa.concat_tables([hostile_drive("a", 50, 1), hostile_drive("b", 50, 2)])
     land(warehouse, "sorted", table)
     (first,) = warehouse.logs.snapshot().files
-    before = grams_of(wide_grams(warehouse, [first], "windows"))
+    before = grams_of(by_kernel(warehouse, [first], "windows"))
     order = np.random.default_rng(0).permutation(100)
     land(warehouse, "mixed", table.take(pa.array(order)))
     other = next(f for f in warehouse.logs.snapshot().files if f.path != first.path)
-    assert grams_of(wide_grams(warehouse, [other], "windows")) == before
+    assert grams_of(by_kernel(warehouse, [other], "windows")) == before
 
 
 def test_products_of_a_block_are_exact_in_binary64() -> None:
