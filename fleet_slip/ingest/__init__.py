@@ -6,7 +6,8 @@ The processing of a row, one module a step, in this order:
    makes one log of several files of a drive.
 2. `batches` reads a file in bounded batches of the columns that the mapping uses, by the reader of
    its format (`formats`); several time bases become one table.
-3. `checked_columns` checks each row by itself: values in SI units, or the reason why it is refused.
+3. `checked_columns` checks each row by itself: converts it to SI units, or rejects it with a
+   reason.
 4. `drives` checks the order of time, splits rows into drives, and collects them until they end.
 5. `ticks` resamples a drive to 100 Hz and rounds its signals to counts.
 6. `logs` processes batches of logs: `recordings` detects erased drives and duplicates, `logs`

@@ -258,7 +258,7 @@ class IngestCounts:
     rows_left_out
         Rows that do not meet the mapping's conditions.
     quarantined
-        Refused rows by reason.
+        Rejected rows by reason.
     ticks
         Rows of the result; equal to `rows_kept` where nothing was resampled.
     """
@@ -296,7 +296,7 @@ def check_rows(
             counts.rows_left_out += raw.height - selected.height
             raw = selected
         groups = keys.assign_groups(raw, fields)
-        rows, refused = _split(raw, groups, fields)
+        rows, rejected = _split(raw, groups, fields)
         if len(keys.metadata) > MAX_KEYS:
             raise InputError(
                 f"{quote_name(file)}: more than {MAX_KEYS:,} combinations of drive metadata. Check "
@@ -304,7 +304,7 @@ def check_rows(
             )
         if mapping.time.rate_hz is not None:
             rows = rows.with_columns((pl.col("row") / mapping.time.rate_hz).alias("time"))
-        yield rows, refused
+        yield rows, rejected
     if not counts.rows_read:
         raise InputError(f"{quote_name(file)}: a header without rows. Export it again.")
     if counts.rows_left_out == counts.rows_read:
@@ -443,13 +443,13 @@ def _split(
     masks = valued.select(
         fault.fill_null(value=False).alias(str(i)) for i, (_, _, fault) in enumerate(faults)
     )
-    is_refused, pieces = pl.repeat(value=False, n=valued.height, eager=True), [no_rows()]
+    is_rejected, pieces = pl.repeat(value=False, n=valued.height, eager=True), [no_rows()]
     for (source, reason, _), mask in zip(faults, masks, strict=True):
         if mask.any():
-            bad = valued.filter(mask & ~is_refused)
+            bad = valued.filter(mask & ~is_rejected)
             pieces.append(describe_rejected(bad, reason, source.name or None, source.raw))
-            is_refused |= mask
-    return valued.filter(~is_refused).select(columns), pl.concat(pieces)
+            is_rejected |= mask
+    return valued.filter(~is_rejected).select(columns), pl.concat(pieces)
 
 
 def describe_rejected(

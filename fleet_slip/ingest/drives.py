@@ -151,11 +151,11 @@ class DriveCutter:
         is_far: BoolArray = ~(np.abs(np.diff(time_s, prepend=before_s)) <= self._gap_s)
         return is_far
 
-    def _reject_rows(self, rows: pl.DataFrame, is_refused: BoolArray, reason: str) -> pl.DataFrame:
+    def _reject_rows(self, rows: pl.DataFrame, is_rejected: BoolArray, reason: str) -> pl.DataFrame:
         """Reject the rows of a mask; return the remaining rows."""
-        if not is_refused.any():
+        if not is_rejected.any():
             return rows
-        mask = pl.Series(is_refused)
+        mask = pl.Series(is_rejected)
         self._reject(describe_rejected(rows.filter(mask), reason))
         return rows.filter(~mask)
 

@@ -143,8 +143,8 @@ class MeasuredLog:
 
     def _checked_rows(self) -> Iterator[pl.DataFrame]:
         """Yield the good rows of each batch; store the rejected ones."""
-        for rows, refused in check_rows(self.file, self.mapping, self._keys, self.counts):
-            self._rejected.add(refused)
+        for rows, rejected in check_rows(self.file, self.mapping, self._keys, self.counts):
+            self._rejected.add(rejected)
             yield rows
 
     def _resample(self, segments: Iterable[DriveSamples]) -> Iterator[MeasuredDrive]:
@@ -260,7 +260,7 @@ class MeasuredLog:
         of_signals = {
             key: n for key, n in self._rejected.counts.items() if key[0] in self.mapping.signals
         }
-        faults = [*find_refusals(of_signals, counts.rows_read, counts.quarantined)]
+        faults = [*find_rejections(of_signals, counts.rows_read, counts.quarantined)]
         if twice := sum(map(_overlaps, self._times_s.values())):
             faults.append(CHECKS["one car twice at a time"].fault("time", count=twice))
         rate_khz = 1e-3 / self.longest.interval_s if self.longest else 0.0
@@ -333,7 +333,7 @@ def _file_digest(file: Path) -> "hashlib._Hash":
 # Faults of a log as a whole: many rejected rows, a car in two drives at once, and an unmapped
 # column that is named like cars.
 
-MIN_REFUSED = 10
+MIN_REJECTED = 10
 _REFUSED: dict[str, Check] = {
     "out_of_range": CHECKS["values out of range"],
     "not_a_number": CHECKS["texts in place of numbers"],
@@ -343,16 +343,16 @@ _OF_TIME = ("time", "isolated", "too_short", "not_a_time")
 MAX_NAMES, MIN_ROWS_PER_NAME = 1000, 20
 
 
-def find_refusals(
-    refused: Named[tuple[str, str], int], rows: int, reasons: Named[str, int]
+def find_rejections(
+    rejected: Named[tuple[str, str], int], rows: int, reasons: Named[str, int]
 ) -> Iterator[Fault]:
     """Yield a fault for each signal that rejects more than a tenth of a file's rows.
 
-    The rejected rows of all other reasons together are a fault above the same limit. `refused` are
+    The rejected rows of all other reasons together are a fault above the same limit. `rejected` are
     rejected rows by signal and reason, `reasons` all rejected rows by reason.
     """
-    limit = max(rows * CHECKS["refused rows"].high, MIN_REFUSED)
-    several = {key: count for key, count in refused.items() if count > limit}
+    limit = max(rows * CHECKS["refused rows"].high, MIN_REJECTED)
+    several = {key: count for key, count in rejected.items() if count > limit}
     for (name, reason), count in several.items():
         check = _REFUSED.get(reason, CHECKS["refused values"])
         yield check.fault(name, count=count, rows=rows, reason=reason)

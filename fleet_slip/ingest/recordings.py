@@ -64,26 +64,26 @@ def drop_erased_drives(
 
 
 def drop_erased_rejects(
-    refused: pa.Table, erasure_log: ErasureLog, left_out: Collection[str] = ()
+    rejected: pa.Table, erasure_log: ErasureLog, erased_drives: Collection[str] = ()
 ) -> pa.Table:
     """Return the rejected rows without those of erased cars and drives.
 
-    `left_out` are the erased drives of their file. A rejected row contains the name of the drive
+    `erased_drives` are those of their file. A rejected row contains the name of the drive
     before it was cut; the names of the segments begin with it.
     """
     vehicles, named = (
-        set(refused[column].unique().drop_null().cast(pa.string()).to_pylist())
+        set(rejected[column].unique().drop_null().cast(pa.string()).to_pylist())
         for column in ("vehicle_id", "drive_id")
     )
     erased = erasure_log.erased(vehicles, named)
-    drives = erased.drives | set(left_out)
+    drives = erased.drives | set(erased_drives)
     prefixes = {name for name in named if any(drive.startswith(f"{name}-") for drive in drives)}
     for column, erased_names in (("vehicle_id", erased.vehicles), ("drive_id", drives | prefixes)):
         if erased_names:
             names = pa.array(sorted(erased_names), pa.string())
-            is_erased = pc.is_in(refused[column].cast(pa.string()), names)
-            refused = refused.filter(pc.invert(pc.fill_null(is_erased, False)))
-    return refused
+            is_erased = pc.is_in(rejected[column].cast(pa.string()), names)
+            rejected = rejected.filter(pc.invert(pc.fill_null(is_erased, False)))
+    return rejected
 
 
 # A fingerprint identifies a recording: a digest of a file's bytes, or of a drive's counts. Each is

@@ -13,7 +13,7 @@ import pytest
 import fleet_slip
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import AlarmError
-from fleet_slip.ingest.measured_log import find_refusals, open_measured
+from fleet_slip.ingest.measured_log import find_rejections, open_measured
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.drive_signals import RADIUS_M, WHEELS
 from fleet_slip.quality.plausibility import SoundDrive, check_plausibility, find_one_sided
@@ -213,18 +213,18 @@ def test_a_unit_that_lies_so_much_that_rows_are_refused_is_told(tmp_path: Path) 
 def test_few_refused_rows_are_no_suspicion() -> None:
     refused = {("ax", "out_of_range"): 100, ("ay", "not_a_number"): 101, ("vx", "new"): 500}
     reasons = {reason: count for (_, reason), count in refused.items()}
-    faults = [(fault.kind, fault.signals) for fault in find_refusals(refused, 1000, reasons)]
+    faults = [(fault.kind, fault.signals) for fault in find_rejections(refused, 1000, reasons)]
     assert faults == [("texts", ("ay",)), ("values", ("vx",))]
     small_counts = {("ax", "out_of_range"): 60, ("ay", "out_of_range"): 60}
-    (together,) = find_refusals(small_counts, 1000, {"out_of_range": 120})
+    (together,) = find_rejections(small_counts, 1000, {"out_of_range": 120})
     assert together.figure == "120 of 1,000 rows were refused, 120 of them: out_of_range"
-    assert not list(find_refusals({("ax", "out_of_range"): 10}, 12, {"out_of_range": 10}))
+    assert not list(find_rejections({("ax", "out_of_range"): 10}, 12, {"out_of_range": 10}))
     for reason, hint in (("time_duplicate", True), ("time_backwards", True), ("not_a_time", False)):
-        (untimed,) = find_refusals({}, 1000, {reason: 60, "missing": 50})
+        (untimed,) = find_rejections({}, 1000, {reason: 60, "missing": 50})
         assert (untimed.kind, untimed.signals) == ("values", ("time",))
         assert f"110 of 1,000 rows were refused, 60 of them: {reason}" in str(untimed)
         assert ("drive.column if the file mixes cars or trips" in untimed.remedy) == hint
-    assert not list(find_refusals({}, 1000, {"no_value": 90}))
+    assert not list(find_rejections({}, 1000, {"no_value": 90}))
 
 
 def test_ingest_says_once_what_looks_wrong_in_files_that_land_together(tmp_path: Path) -> None:
