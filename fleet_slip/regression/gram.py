@@ -54,6 +54,8 @@ class Gram:
 
     def __post_init__(self) -> None:
         k = len(self.signals)
+        if len(set(self.signals)) != k:
+            raise ValueError(f"a signal is repeated in {self.signals}")
         if len(self.sums) != k or len(self.products) != packed_size(k):
             raise ValueError(f"{k} signals need {k} sums and {packed_size(k)} products")
 
@@ -294,6 +296,9 @@ class GramTable:
         drives, k = len(self.n), len(self.signals)
         if self.sums.shape != (drives, k) or self.products.shape != (drives, packed_size(k)):
             raise ValueError(f"sums or products are not those of {drives} drives of {k} signals")
+        kinds = {self.n.dtype, self.sums.dtype, self.products.dtype}
+        if not kinds <= {np.dtype(np.int64), np.dtype(object)}:
+            raise ValueError("a GramTable holds int64, or integers of Python")
 
     def __len__(self) -> int:
         return len(self.n)
