@@ -9,14 +9,18 @@ from io import StringIO
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalog.arithmetic import COMPUTED, nearest
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import round_number
-from fleet_slip.catalog.signals import COUNT_MAX
+from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
+from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.columns.lowering import power
-from fleet_slip.errors import InputError
+from fleet_slip.errors import InputError, RefusedError
 from fleet_slip.export.program import Input, Program, write_program
+from fleet_slip.grams.compute import counts_of
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
 
@@ -242,6 +246,7 @@ def compile_program(catalog: Catalog, manifest: Manifest) -> Program:
 
 
 # Checks are ticks of synthetic drives, with the angle at each. An export contains no logged data.
+# The kernel of the warehouse, which does not use programs, computes the angles again.
 
 SMOOTH_TICKS = 300
 HOSTILE_TICKS = 200
@@ -267,7 +272,10 @@ class TestVector:
 
 
 def make_checks(catalog: Catalog, manifest: Manifest, program: Program) -> tuple[TestVector, ...]:
-    """Return a smooth drive and adversarial ones, with the angle at every tick."""
+    """Return a smooth drive and adversarial ones, with the angle at every tick.
+
+    Raises `RefusedError` if the estimator and the kernel of the warehouse differ.
+    """
     facts = {a.name: 2**16 if a.equals is None else a.equals for a in program.facts}
     ends = ((number, (-1) ** (i + 1) * COUNT_MAX) for i, number in enumerate(program.numbers))
     hostile = facts | {number.name: count * number.grain for number, count in ends}
@@ -293,8 +301,69 @@ def make_checks(catalog: Catalog, manifest: Manifest, program: Program) -> tuple
             tuple(angles),
             tuple(states) if program.states else (),
         )
+        _compare_with_kernel(catalog.signals, manifest, program, check)
         checks.append(check)
     return tuple(checks)
+
+
+def _compare_with_kernel(
+    signals: SignalCatalog, manifest: Manifest, program: Program, check: TestVector
+) -> None:
+    """Raise `RefusedError` if the kernel computes other angles than those of the test vector."""
+    counts = zip(program.numbers, check.numbers, strict=True)
+    numbers = {number.name: count for number, count in counts if count is not None}
+    expected = angles_by_kernel(signals, manifest, program, check.car, numbers, check.samples)
+    for tick, (angle, kernel_angle) in enumerate(zip(check.angles, expected, strict=True)):
+        if angle != kernel_angle:
+            raise RefusedError(
+                f"{manifest.name} cannot be exported: at tick {tick} of the check {check.name!r}, "
+                f"its program computes the angle {angle}, and the kernel of the warehouse "
+                f"{kernel_angle}. Keep the version, and report this fault of fleet-slip."
+            )
+
+
+def angles_by_kernel(
+    signals: SignalCatalog,
+    manifest: Manifest,
+    program: Program,
+    facts: Mapping[str, object],
+    numbers: Mapping[str, int],
+    samples: Sequence[Sample],
+) -> list[int | None]:
+    """Compute the angle of each tick from the columns of the kernel, in exact integers."""
+    predictor = Predictor.from_manifest(signals, manifest)
+    drive = drive_counts(program, predictor, facts, numbers, samples)
+    return angles_of_columns(program, compute_columns(predictor.plan, drive))
+
+
+def drive_counts(
+    program: Program,
+    predictor: Predictor,
+    facts: Mapping[str, object],
+    numbers: Mapping[str, int],
+    samples: Sequence[Sample],
+) -> DriveCounts:
+    """Convert samples of consecutive ticks to a drive of the warehouse."""
+    valid = zip(*(valid_counts(sample, program.signals) for sample in samples), strict=True)
+    counts = {
+        signal.name: pa.array(values, pa.int16())
+        for signal, values in zip(program.signals, valid, strict=True)
+    }
+    rows = pa.table({"tick": np.arange(len(samples), dtype=np.int64), **counts})
+    used = {name: facts.get(name) for name in predictor.plan.facts}
+    return counts_of(rows, predictor.plan, used, numbers)
+
+
+def angles_of_columns(program: Program, columns: FloatArray) -> list[int | None]:
+    """Compute the angle of each row from the columns of the terms, shape (terms, rows)."""
+    angle = program.angle
+    missing: BoolArray = np.any(np.isnan(columns), axis=0)
+    counts = np.where(missing, 0.0, columns).astype(np.int64).astype(object)
+    total = np.full(columns.shape[1], angle.intercept + (1 << (angle.bits - 1)), dtype=object)
+    for (_, coefficient), column in zip(angle.terms, counts, strict=True):
+        total += coefficient * column
+    rounded = [max(-angle.limit, min(angle.limit, int(value >> angle.bits))) for value in total]
+    return [None if lacks else value for value, lacks in zip(rounded, missing, strict=True)]
 
 
 def valid_counts(sample: Sample, signals: Sequence[Input]) -> Sample:

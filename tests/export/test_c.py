@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.export.stepping import Estimator, compile_program
+from fleet_slip.export.stepping import Estimator, angles_by_kernel, compile_program
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import (
     DEADLINE_S,
@@ -22,7 +22,6 @@ from tests.export.compiled import (
     needs_cc,
     run_compiled,
 )
-from tests.export.kernel import angles_by_kernel
 from tests.export.models import (
     BLENDS,
     CARS,
@@ -49,7 +48,9 @@ def test_hostile_drives_give_the_angles_of_the_kernel(name: str, tmp_path: Path)
     for seed, car in enumerate(CARS):
         samples = hostile_drive(program, 400, seed)
         computed = drive(driver, program, car, samples)
-        assert computed == angles_by_kernel(SIGNALS, manifest, program, car, samples)
+        assert computed == angles_by_kernel(
+            SIGNALS, manifest, program, car.facts, car.numbers, samples
+        )
         angles |= {*computed}
     assert len(angles) > 10
     assert None in angles

@@ -8,10 +8,9 @@ import pytest
 from cantools.database.can.database import Database
 
 from fleet_slip.export.program import Program
-from fleet_slip.export.stepping import Sample, compile_program
+from fleet_slip.export.stepping import Sample, angles_by_kernel, compile_program
 from fleet_slip.models.registry import ModelVersion
 from tests.export.cars import Car
-from tests.export.kernel import angles_by_kernel
 from tests.export.models import DEFINITIONS, export_texts, hostile_drive, model_of
 from tests.support.catalog import CATALOG, SIGNALS
 
@@ -50,7 +49,7 @@ def test_a_drive_over_the_bus_gives_the_same_angles(bus: Database) -> None:
     received = [over_the_bus(bus, PROGRAM, sample) for sample in samples]
     car = Car({"mass_kg": 1500.0, "vehicle_model": "suv"}, {})
     sent, angles = (
-        angles_by_kernel(SIGNALS, VERSION.manifest, PROGRAM, car, counts)
+        angles_by_kernel(SIGNALS, VERSION.manifest, PROGRAM, car.facts, car.numbers, counts)
         for counts in (samples, received)
     )
     assert angles == sent

@@ -30,6 +30,7 @@ from fleet_slip.export.program import Program
 from fleet_slip.export.stepping import (
     Estimator,
     Sample,
+    angles_by_kernel,
     compile_program,
     make_checks,
 )
@@ -37,8 +38,6 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.vehicle.parameters import VehicleMeasures
 from tests.export import plain
-from tests.export.cars import Car
-from tests.export.kernel import angles_by_kernel
 from tests.export.models import (
     BLENDS,
     CAR,
@@ -96,7 +95,7 @@ def test_kernel_estimator_and_document_agree_on_hostile_drives(name: str) -> Non
     manifest = model_with(BLENDS[name])
     program = compile_program(CATALOG, manifest)
     samples = hostile_drive(program, 250, 1)
-    angles = angles_by_kernel(SIGNALS, manifest, program, Car({}, {}), samples)
+    angles = angles_by_kernel(SIGNALS, manifest, program, {}, {}, samples)
     assert plain.angles(program_content(program), [], [], samples) == angles
     stepped = by_stepping(manifest, program, samples)
     scale = float(program.angle.scale)

@@ -12,11 +12,10 @@ import fleet_slip
 from fleet_slip.errors import ConfigError
 from fleet_slip.export import files as export
 from fleet_slip.export.files import export_files
-from fleet_slip.export.stepping import compile_program
+from fleet_slip.export.stepping import angles_by_kernel, compile_program
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import needs_cc
 from tests.export.fmus import Fmu, drive_fmu, run_fmpy, simulate_with_fmpy, unpack
-from tests.export.kernel import angles_by_kernel
 from tests.export.models import BLENDS, CARS, hostile_drive, version_of
 from tests.support.catalog import CATALOG, SIGNALS
 
@@ -50,7 +49,9 @@ def test_hostile_drives_give_the_angles_of_the_kernel(instance: Fmu, version: Mo
     program = compile_program(CATALOG, version.manifest)
     for seed, car in enumerate(CARS):
         samples = hostile_drive(program, 200, seed)
-        expected = angles_by_kernel(SIGNALS, version.manifest, program, car, samples)
+        expected = angles_by_kernel(
+            SIGNALS, version.manifest, program, car.facts, car.numbers, samples
+        )
         assert drive_fmu(instance, program, car, samples) == expected
 
 

@@ -36,6 +36,8 @@ from fleet_slip.export.program import Program
 from fleet_slip.export.stepping import (
     Estimator,
     Sample,
+    angles_by_kernel,
+    angles_of_columns,
     compile_program,
 )
 from fleet_slip.models.manifest import Manifest, ModelTerm
@@ -44,7 +46,6 @@ from tests.export import plain
 from tests.export.cars import Car
 from tests.export.compiled import build_driver, drive, needs_cc
 from tests.export.engines import by_duckdb, by_sqlite, open_session, run_drives
-from tests.export.kernel import angles_by_kernel, angles_of_columns
 from tests.export.models import cars, export_texts
 from tests.support.catalog import CATALOG
 from tests.support.manifests import manifest
@@ -296,7 +297,10 @@ def test_kernel_warehouse_and_estimator_are_what_the_interpreter_says(
     values = data.draw(drives(program))
     samples = counts_of(program, values)
     expected = judged(program, car, samples)
-    assert angles_by_kernel(CATALOG.signals, model, program, car, samples) == expected
+    assert (
+        angles_by_kernel(CATALOG.signals, model, program, car.facts, car.numbers, samples)
+        == expected
+    )
     if not program.numbers:
         assert by_warehouse(model, program, car, samples) == expected
     estimator = Estimator(CATALOG, model, constants_of(program, car))
@@ -391,6 +395,6 @@ def test_a_feature_that_can_be_defined_can_be_exported(text: str, divisor: int) 
     model = manifest(name="any").model_copy(update={"terms": (term,)})
     program = compile_program(CATALOG, model)
     samples: list[Sample] = [(n,) * len(program.signals) for n in (None, -3, 0, 7, 30000)]
-    assert angles_by_kernel(CATALOG.signals, model, program, Car({}, {}), samples) == judged(
+    assert angles_by_kernel(CATALOG.signals, model, program, {}, {}, samples) == judged(
         program, Car({}, {}), samples
     )

@@ -12,11 +12,10 @@ from fleet_slip.catalog.definitions import Definition
 from fleet_slip.errors import ConfigError
 from fleet_slip.export.files import export_files
 from fleet_slip.export.onnx import FloatName, error_bound
-from fleet_slip.export.stepping import compile_program
+from fleet_slip.export.stepping import compile_program, drive_counts
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from tests.export.engines import in_si, open_session, run_drives
-from tests.export.kernel import drive_counts
 from tests.export.models import CARS, DEFINITIONS, MODELS, hostile_drive, model_of, version_of
 from tests.support.catalog import CATALOG, SIGNALS
 
@@ -30,7 +29,7 @@ def test_hostile_drives_are_within_the_stated_error(name: str, kind: FloatName) 
     samples = [hostile_drive(program, 250, seed) for seed in range(len(CARS))]
     expected = np.array(
         [
-            predictor(drive_counts(program, predictor, car, drive))
+            predictor(drive_counts(program, predictor, car.facts, car.numbers, drive))
             for car, drive in zip(CARS, samples, strict=True)
         ]
     )
@@ -55,7 +54,7 @@ def test_a_feature_of_one_value_stands_beside_others(monkeypatch: pytest.MonkeyP
     samples = hostile_drive(program, 50, 1)
     session = open_session(ModelVersion(1, manifest, "0" * 64, CATALOG), "float64")
     angles = run_drives(session, program, CARS[:1], in_si(program, samples, "float64")[None])[0]
-    expected = predictor(drive_counts(program, predictor, CARS[0], samples))
+    expected = predictor(drive_counts(program, predictor, CARS[0].facts, CARS[0].numbers, samples))
     assert np.isfinite(expected).any()
     assert np.allclose(angles, expected, rtol=0, atol=1e-12, equal_nan=True)
 

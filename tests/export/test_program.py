@@ -14,8 +14,9 @@ import pytest
 import fleet_slip
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalog.definitions import Combination, Definition
-from fleet_slip.errors import InputError, QuestionError, UsageError
-from fleet_slip.export.files import program_content
+from fleet_slip.errors import InputError, QuestionError, RefusedError, UsageError
+from fleet_slip.export import stepping
+from fleet_slip.export.files import export_files, program_content
 from fleet_slip.export.stepping import Estimator, compile_program, make_checks
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
@@ -29,6 +30,7 @@ from tests.export.models import (
     export_texts,
     hostile_version,
     model_of,
+    version_of,
 )
 from tests.support.catalog import CATALOG
 
@@ -74,6 +76,23 @@ def test_columns_of_more_than_63_bits_have_no_program(
         for check in make_checks(CATALOG, manifest, program):
             samples = list(check.samples)
             assert plain.angles(program_content(program), [], [], samples) == list(check.angles)
+
+
+@pytest.mark.parametrize(("operation", "name"), [("nearest", "every_kind"), ("*", "learning")])
+def test_a_program_that_differs_from_the_kernel_is_not_exported(
+    monkeypatch: pytest.MonkeyPatch, operation: str, name: str
+) -> None:
+    version = version_of(name)
+    export_files(version, None, "json")
+    compute = stepping._OPERATIONS[operation]
+
+    def wrong(a: int, b: int) -> int | None:
+        result = compute(a, b)
+        return result if result is None or abs(result) < 50 else result + 1000
+
+    monkeypatch.setitem(stepping._OPERATIONS, operation, wrong)
+    with pytest.raises(RefusedError, match=r"at tick \d+ of the check .* the kernel"):
+        export_files(version, None, "json")
 
 
 def test_a_feature_defined_in_two_ways_is_refused() -> None:
