@@ -164,7 +164,7 @@ class ColumnSources:
             raise ValueError(f"{name}: no column over time")
         where, family_name, family = self.families[name]
         if where in self._begun:
-            raise ValueError(f"{where}: it is made of itself")
+            raise ValueError("it is made of itself")
         self._begun.add(where)
         try:
             self.columns |= family.make(family_name, self)
@@ -227,6 +227,8 @@ class Window(ScaledFamily):
     def _ticks_fit(self) -> "Window":
         if any(not 1 <= n <= MAX_CHANGE_TICKS for n in self.ticks):
             raise ValueError(f"ticks must lie in 1..{MAX_CHANGE_TICKS}")
+        if bool(self.ticks) != (TICKS in self.column):
+            raise ValueError(f"column must contain {TICKS} if there are ticks, and only then")
         return self
 
     def names(self, name: str) -> tuple[str, ...]:
@@ -361,7 +363,7 @@ class EquationColumns(Config):
     y: dict[Identifier, Literal[-1, 1]] = Field(min_length=1)
     of: Identifier
     beside: tuple[Identifier | int, ...] = ()
-    weight: Decimal = Decimal(1)
+    weight: Decimal = Field(default=Decimal(1), gt=0, le=1)
 
 
 class SlopeColumn(ScaledFamily):

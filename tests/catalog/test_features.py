@@ -1,5 +1,6 @@
 """Features against their physical definitions, and kinds of Gram rows against plain integers."""
 
+import re
 from collections.abc import Callable
 from fractions import Fraction
 from itertools import pairwise
@@ -436,6 +437,41 @@ def test_a_family_in_a_model_list_stands_for_its_members() -> None:
     families = ("excess", "road", "cornering")
     assert gates == [name for family in families for name in CATALOG.members(family)]
     assert set().union(*(models[family] for family in families)) == set(models["all"])
+
+
+WINDOW = 'of = "ay"\nover = "mean"\nticks = [5, 9]\ncolumn = "any_{ticks}"'
+MEAN_SO_FAR = 'of = "ay"\nover = "running_mean"\ncolumn = "any_{ticks}"'
+CIRCLE = (
+    'of = ["ay", "other"]\ncolumn = "any"\n'
+    '[products.other]\nof = ["any", "ay"]\nscale = 1\nunit = "1"\ncolumn = "other"\n'
+    'description = "x"\n'
+)
+SLOPE = 'ridge = [1]\ncolumn = "any"\nequations = [{ y = { ay_mean_8 = 1 }, of = "ay_mean_16", '
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "words"),
+    [
+        ("windows", WINDOW.replace("[5, 9]", "[5]").replace("_{ticks}", ""), "must contain {ticks"),
+        ("windows", MEAN_SO_FAR, "must contain {ticks} if there are ticks, and only then"),
+        ("windows", WINDOW.replace("9", "5"), "any_5 appears twice"),
+        ("windows", WINDOW.replace("mean", "running_mean"), "ticks is for mean"),
+        (
+            "products",
+            'of = ["ay", "any"]\ncolumn = "any"',
+            "toml: products.any: it is made of itself",
+        ),
+        ("products", CIRCLE, "toml: products.any: products.other: it is made of itself"),
+        ("slopes", SLOPE + "weight = 0 }]", "weight: must be greater than 0"),
+        ("slopes", SLOPE + "weight = 1.5 }]", "weight: must be less than or equal to 1"),
+    ],
+)
+def test_faults_of_columns_over_time_are_named(
+    tmp_path: Path, kind: str, text: str, words: str
+) -> None:
+    entry = f'[{kind}.any]\nscale = 0.001\nunit = "1"\ndescription = "x"\n{text}\n'
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        load_catalog(configs_with(tmp_path / "configs", features=entry))
 
 
 Rows = NDArray[np.float64]
