@@ -325,7 +325,7 @@ def test_kernel_warehouse_and_estimator_are_what_the_interpreter_says(
         HealthCheck.function_scoped_fixture,
     ],
 )
-@given(one=models(), car=cars(), data=st.data())
+@given(model=models(), car=cars(), data=st.data())
 def test_exports_are_what_the_interpreter_says(
     model: Manifest, car: Car, data: st.DataObject, tmp_path: Path
 ) -> None:
