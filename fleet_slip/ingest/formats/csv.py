@@ -145,11 +145,11 @@ class CsvSource(Source):
                 )
             lines, remainder = block[:end], block[end:]
             if lines:
-                _decode(lines, self._budget)
+                _require_text(lines, self._budget)
                 before = lines[lines.rfind(b"\n", 0, -1) + 1 :]
                 yield lines
         if remainder:
-            _decode(remainder, self._budget)
+            _require_text(remainder, self._budget)
             yield self._with_cut_marked(remainder, before, width)
 
     def _with_cut_marked(self, line: bytes, before: bytes, width: int) -> bytes:
@@ -267,6 +267,11 @@ def _end_of_lines(block: bytes) -> int:
         quotes -= block.count(b'"', before, end)
         end = before
     return end
+
+
+def _require_text(block: bytes, budget: Budget) -> None:
+    if b"\0" in block or not block.isascii():
+        _decode(block, budget)
 
 
 def _decode(block: bytes, budget: Budget) -> str:
