@@ -126,7 +126,7 @@ def ingest(
 
     def print_report(report: "IngestReport") -> None:
         if not (json or folders):
-            say(_ingested(report.file, [report]))
+            say(summarize_ingest(report.file, [report]))
         for suspicion in report.suspicions:
             if (suspicion.kind, suspicion.signals) not in warned:
                 warned.add((suspicion.kind, suspicion.signals))
@@ -145,13 +145,12 @@ def ingest(
         print_json(reports)
     elif folders:
         new = sum(report.new for report in reports)
-        say(_ingested(pluralize(new, "new file"), reports) if new else "nothing new")
-    for log in reports:
-        for alarm in log.alarms:
-            raise AlarmError(
-                f"{log.file}: {alarm} Its rows are stored. Correct the mapping and repeat the "
-                "command with --replace."
-            )
+        say(summarize_ingest(pluralize(new, "new file"), reports) if new else "nothing new")
+    if alarms := [f"{report.file}: {alarm}" for report in reports for alarm in report.alarms]:
+        raise AlarmError(
+            f"{alarms[0]} Its rows are stored. Correct the mapping and repeat the command with "
+            "--replace."
+        )
 
 
 def warn_of_passed_over(files: Sequence[str]) -> None:
@@ -162,7 +161,7 @@ def warn_of_passed_over(files: Sequence[str]) -> None:
         say(passed_over, logging.WARNING)
 
 
-def _ingested(subject: str, reports: "Sequence[IngestReport]") -> str:
+def summarize_ingest(subject: str, reports: "Sequence[IngestReport]") -> str:
     """Summarise the reports of files in a sentence."""
     from fleet_slip.warehouse.erasure_log import skipped_drives
 

@@ -38,12 +38,22 @@ def sql(
     json: opt.Json = False,
     csv: Annotated[bool, Option("--csv", help="Print CSV on stdout.")] = False,
     exact: Annotated[
-        bool, Option("--exact", help="Mark no texts of CSV that a spreadsheet takes for formulas.")
+        bool,
+        Option(
+            "--exact",
+            help="Print texts of CSV unchanged. By default, texts that a spreadsheet takes for "
+            "formulas get an apostrophe.",
+        ),
     ] = False,
     output: Annotated[Path | None, Option(help="File to write: .parquet, .csv or .json.")] = None,
     everything: opt.All = False,
     unsafe: Annotated[
-        bool, Option("--unsafe", help="Allow any statement and file: it can overwrite data.")
+        bool,
+        Option(
+            "--unsafe",
+            help="Allow any statement, and any file that you may read or write. Use it only for "
+            "SQL that you trust: it can overwrite the data root.",
+        ),
     ] = False,
 ) -> None:
     """Query the data root: log (SI), log_counts, drives, grams, models, quarantine, dictionary.

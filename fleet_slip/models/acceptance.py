@@ -94,7 +94,7 @@ class Comparison:
     Attributes
     ----------
     by
-        What was held out, vehicle or drive.
+        Unit that was held out: vehicle or drive.
     challenger
         Refitted without each group that it is tested on.
     champion
@@ -144,7 +144,7 @@ class ChallengerEvaluation:
     signals
         Inputs of the challenger and the champion.
     by
-        What is held out, vehicle or drive.
+        Unit that is held out: vehicle or drive.
     procedure
         Fits the challenger; searches its columns again if a search found them.
     """
@@ -180,7 +180,7 @@ class ChallengerEvaluation:
     def groups(self, cohort: Cohort, mask: BoolArray | None = None) -> Folds:
         """Return the drives that have all signals, by group, or the masked drives of each group.
 
-        Raises `DataError` without.
+        Raises `DataError` if no drive has them.
         """
         if mask is None:
             folds = cohort.folds(self.by, MAX_GROUPS)
@@ -260,7 +260,7 @@ class TrainingSplit:
         return self.evaluation.compare(groups, tested)
 
     def compare_unseen(self) -> Comparison | None:
-        """Compare on drives that the champion was not trained on: elsewhere it has an advantage.
+        """Compare on drives outside the training of the champion, where it has no advantage.
 
         Returns None if these are all drives, or of fewer than `MIN_VEHICLES` groups.
         """

@@ -95,9 +95,10 @@ def find_reversed_or_swapped(
     """Return the drives in which witnesses of the turning direction contradict the others.
 
     The first principal component of their correlations divides them in two groups. The smaller one
-    is in doubt; of two witnesses both are. Where no more than two contradict both axles, it is
-    these: their axes are not ISO 8855. A witness is at fault if the median of its correlations with
-    the other group is below -`min_correlation`, by default the threshold of the check.
+    is in doubt; if there are two witnesses, both are. If at most two contradict both axles, these
+    are at fault: their axes are not ISO 8855. A witness is at fault if the median of its
+    correlations with the other group is below -`min_correlation`, by default the threshold of the
+    check.
     """
     witnesses = _witnesses(moments)
     names = witnesses.signals
@@ -407,7 +408,7 @@ def find_delays(signals: Signals, rows: BoolArray) -> Iterator[Fault]:
     errors = sorted(delay.error_s for delay in delays.values())
     check = CHECKS["delay of a signal"]
     for name, delay in delays.items():
-        # The reference itself has no error; that of the others' median stands for it.
+        # The reference has no error of its own: use the median error of the other signals.
         late = SignalDelay(delay.value_s - middle, max(delay.error_s, errors[len(errors) // 2]))
         if _is_late(name, late, check.high):
             yield check.fault(*WITNESSES[name], delay_s=late.value_s, error_s=late.error_s)
