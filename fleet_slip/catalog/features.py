@@ -592,6 +592,8 @@ class FeatureFile(Config):
             ]
             if unknown:
                 raise ValueError(f"sets.{name}: unknown {', '.join(unknown)}")
+            if entry.of and self.sets[entry.of].of:
+                raise ValueError(f"sets.{name}: {entry.of} is itself a set of changes")
             constant = [c for c in entry.calibrated if entry.change_s and self.calibrated[c].alone]
             if constant:
                 raise ValueError(f"sets.{name}: {', '.join(constant)}: a number does not change")

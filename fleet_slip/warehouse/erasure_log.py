@@ -99,7 +99,7 @@ def _entry(folder: DocumentFolder, number: int) -> Mapping[str, Any]:
 
 def skipped_drives(count: int) -> str:
     """Return the end of a sentence on drives that were not written; empty for none."""
-    allow = "fleet-slip forget --allow readmits them"
+    allow = "fleet-slip forget --allow admits new rows"
     return f"; {pluralize(count, 'drive')} skipped: forgotten before ({allow})" if count else ""
 
 

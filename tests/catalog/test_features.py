@@ -431,6 +431,12 @@ def test_faults_are_named(tmp_path: Path, text: str, words: str) -> None:
     assert "gates.mine" in str(caught.value)
 
 
+def test_a_set_of_changes_of_itself_is_refused(tmp_path: Path) -> None:
+    sets = '[sets.mine]\ndescription = "x"\nof = "mine"\nchange_s = 1\n'
+    with pytest.raises(ConfigError, match="mine is itself a set of changes"):
+        load_catalog(configs_with(tmp_path / "configs", features=sets))
+
+
 def test_a_family_in_a_model_list_stands_for_its_members() -> None:
     models = {model.name: model.signals for model in load_model_list(CATALOG, "gated").model}
     gates = [name for name in models["all"] if name not in models["no gate"]]
