@@ -241,7 +241,7 @@ def _encode_mdf(tables: Sequence[pa.Table], about: dict[str, str]) -> bytes:
         file.header.comment = "; ".join(f"{key}: {value}" for key, value in about.items())
         for table in tables:
             name, frame = table["drive_id"][0].as_py(), table.drop(["drive_id"]).to_pandas()
-            frame = frame.set_index("time_s").dropna(axis=1, how="all")
+            frame = frame.set_index("time_s").rename_axis("time").dropna(axis=1, how="all")
             frame = frame.rename(columns=lambda column: column.removesuffix("_deg"))
             units = dict.fromkeys(frame.columns, "deg")
             file.append(frame, acq_name=name, comment=name, common_timebase=True, units=units)

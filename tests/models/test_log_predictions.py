@@ -85,6 +85,7 @@ def test_csv_and_mdf_have_the_same_numbers_and_no_reference_is_empty(
         assert [entry.channel_group.acq_name for entry in file.groups] == frame["drive_id"].unique(
             maintain_order=True
         ).to_list()
+        assert file.groups[0].channels[0].name == "time"
     assert groups[0].unit == "deg"
     values = np.concatenate([group.samples for group in groups])
     assert values == pytest.approx(frame["sideslip_estimate_deg"].to_numpy())
