@@ -152,7 +152,8 @@ def broken_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def skewed(*arguments: Any) -> None:
         simulate(*arguments)
-        arguments[6][:] *= 1 + 1e-8  # the truth of all lanes
+        with np.errstate(all="ignore"):  # rows after the end of a drive are not initialized
+            arguments[6][:] *= 1 + 1e-8  # the truth of all lanes
 
     monkeypatch.setattr(lanes, "simulate_lanes", skewed)
 
