@@ -64,7 +64,7 @@ def select(
     print_answer(selection, json, everything=everything, hint="--all")
     if save is not None:
         remark = f". Publish it: fleet-slip publish NAME --models {save}"
-        write_text(save, selection.compared.as_toml(), "" if json else remark)
+        write_text(save, selection.candidate_list.as_toml(), "" if json else remark)
 
 
 def publish(

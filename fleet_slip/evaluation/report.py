@@ -67,7 +67,7 @@ def table_one(data: ReportData) -> ReportTable:
         error, rmse = f"± {number(row.standard_error, 4)}", degrees(row.pooled.rmse_deg)
         rows.append([row.name, ", ".join(row.signals), number(paper, 4), ours, error, rmse])
     noise = data.version.manifest.cross_validation.label_noise_deg
-    folds = selection.compared.folds
+    folds = selection.candidate_list.folds
     note = (
         f"{folds.count} folds by {folds.by}, {count(selection.cohort.rows)} "
         f"rows. {selection.winner.reason} Every RMSE includes the label noise: "

@@ -22,7 +22,7 @@ from fleet_slip.catalog.counts import as_floats, digest_counts, round_chunks
 from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalog.signals import MEASURED, SignalCatalog
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.columns import STEP_S, TIME_EPSILON_S, WHEEL_PREFIX
+from fleet_slip.ingest.columns import STEP_S, TIME_EPSILON_S, WHEEL_PREFIX, SignalColumn
 from fleet_slip.ingest.drives import DriveSamples
 from fleet_slip.ingest.formats.source import EARLIEST_S
 from fleet_slip.ingest.mapping import DriveMetadata, FromColumn, LabelSensor, Mapping
@@ -369,19 +369,13 @@ def on_grid(
     return gridded[0] + heading, gridded[1]
 
 
-def _fixes(
-    rows: DriveSamples, grid: TickGrid, mapping: Mapping, counts: dict[str, pa.Array]
-) -> dict[str, pa.Array]:
-    """Return the counts of course and speed at the ticks nearest to the fixes, null elsewhere.
+def _new_fixes(
+    rows: DriveSamples, source: SignalColumn
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return time in s since the drive began, course in rad and speed in m/s of each new fix.
 
-    A sample equal to the previous one is not a new fix. The course is null without a yaw rate,
-    below `MOVING_MPS`, and where it `is_held` or `is_backwards`.
-
-    In the car's axes the antenna moves by (-r y, r x) relative to the centre of gravity, with the
-    yaw rate r; a slip β causes an error of r y β / speed. A fix that is measured a fraction of a
-    tick before its tick is rotated by r times that time.
+    The course is counter-clockwise from the east. A sample equal to the previous one is no new fix.
     """
-    signals, source = mapping.signal_catalog, mapping.signals[COURSE]
     both = rows.samples(COURSE), rows.samples(SATELLITE_SPEED)
     samples = both[0].join(both[1], on="time", how="inner", maintain_order="left")
     course, speed = samples[COURSE].to_numpy(), samples[SATELLITE_SPEED].to_numpy()
@@ -390,7 +384,24 @@ def _fixes(
     elif source.clockwise_from_north:
         course = np.pi / 2 - course
     is_new = (np.diff(course, prepend=np.nan) != 0) | (np.diff(speed, prepend=np.nan) != 0)
-    time_s = samples["time"].to_numpy()[is_new] - rows.start_s
+    time_s = samples["time"].to_numpy() - rows.start_s
+    return time_s[is_new], course[is_new], speed[is_new]
+
+
+def _fixes(
+    rows: DriveSamples, grid: TickGrid, mapping: Mapping, counts: dict[str, pa.Array]
+) -> dict[str, pa.Array]:
+    """Return the counts of course and speed at the ticks nearest to the fixes, null elsewhere.
+
+    The course is null without a yaw rate, below `MOVING_MPS`, and where it `is_held` or
+    `is_backwards`.
+
+    In the car's axes the antenna moves by (-r y, r x) relative to the centre of gravity, with the
+    yaw rate r; a slip β causes an error of r y β / speed. A fix that is measured a fraction of a
+    tick before its tick is rotated by r times that time.
+    """
+    signals, source = mapping.signal_catalog, mapping.signals[COURSE]
+    time_s, course, speed = _new_fixes(rows, source)
     since = time_s - source.delay_s - grid.start_s
     nearest = np.rint(since / STEP_S)
     place, exists = find_ticks(grid.ticks, nearest)
@@ -398,7 +409,7 @@ def _fixes(
     courses, speeds = (np.full(grid.ticks.size, np.nan) for _ in range(2))
     if place.size:
         yaw_rate = physical(signals, counts, "yaw_rate")
-        course, speed, r = course[is_new][exists], speed[is_new][exists], yaw_rate[place]
+        course, speed, r = course[exists], speed[exists], yaw_rate[place]
         across = r * (source.antenna_x_m or 0.0)
         along = np.sqrt(np.maximum(speed**2 - across**2, 0.0))
         turned = course - np.arctan2(across, along) + r * late_s

@@ -193,7 +193,7 @@ class ChallengerEvaluation:
             folds = CohortFolds.from_tables(
                 drives.tables, FoldAssignment(fold, names), drives.drive_numbers
             )
-        folds = replace(folds, has_intercept=self.selection.compared.intercept)
+        folds = replace(folds, has_intercept=self.selection.candidate_list.intercept)
         return folds.complete_cases(self.signals, cohort.catalog.signals.label)
 
     def as_published(self, tested: Folds) -> CrossValidation:

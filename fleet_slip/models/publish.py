@@ -210,7 +210,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
     catalog = selection.cohort.catalog
     signals = catalog.signals
     winner = selection.winner.model
-    figures, compared, label = winner.pooled, selection.compared, signals[signals.label]
+    figures, candidates, label = winner.pooled, selection.candidate_list, signals[signals.label]
     cohort = selection.cohort
     needed = (*winner.signals, signals.label)
     drives = pack_drives(selection, name)
@@ -222,13 +222,13 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
         ),
         intercept=winner.model.offset,
         intercept_exact=winner.model.intercept,
-        through_origin=not compared.intercept,
+        through_origin=not candidates.intercept,
         terms=tuple(
             _term(catalog, signal, exact, definitions)
             for signal, exact in zip(winner.signals, winner.model.coefficients, strict=True)
         ),
         cross_validation=CrossValidated(
-            folds_by=compared.folds.by,
+            folds_by=candidates.folds.by,
             folds=len(winner.folds),
             correlation=figures.correlation,
             correlation_standard_error=winner.standard_error,

@@ -384,13 +384,13 @@ class SelectionPlan:
         The request of the user.
     request
         The request with the name of its model list, and the label of the list.
-    compared
+    candidate_list
         The models and searches to compare, with the options of the request; None for an order.
     """
 
     original: SelectionRequest
     request: SelectionRequest
-    compared: ModelList | None
+    candidate_list: ModelList | None
     feature_set: str
     folds: Folding
 

@@ -180,9 +180,9 @@ def select_without(cohort: Cohort, plan: SelectionPlan, held_out: BoolArray) -> 
     """
     cohort = cohort.filter(~held_out)
     if len(cohort.drives[FOLD_KEYS[plan.folds.by]].unique()) < 2:
-        folds, compared = Folding(by="drive", count=plan.folds.count), plan.compared
-        compared = compared and compared.model_copy(update={"folds": folds})
-        plan = replace(plan, folds=folds, compared=compared)
+        folds, candidate_list = Folding(by="drive", count=plan.folds.count), plan.candidate_list
+        candidate_list = candidate_list and candidate_list.model_copy(update={"folds": folds})
+        plan = replace(plan, folds=folds, candidate_list=candidate_list)
     return select_models(cohort, plan)
 
 
@@ -197,8 +197,8 @@ def cross_validate_choice(cohort: Cohort, plan: SelectionPlan) -> NestedErrors |
             return None
         cohort = load_cohort(cohort.source, cohort.predicate, cohort.feature_set)
     groups = np.array(deal_trips(cohort.drives["trip"].to_pylist()))
-    compared = plan.compared
-    has_choice = compared is None or compared.search or len(compared.model) > 1
+    candidate_list = plan.candidate_list
+    has_choice = candidate_list is None or candidate_list.search or len(candidate_list.model) > 1
     if len(np.unique(groups)) < MIN_DRIVES or not has_choice:
         return None
     errors: list[ErrorSums] = []
@@ -238,17 +238,17 @@ def select_models(cohort: Cohort, plan: SelectionPlan) -> Selection:
     if plan.request.robust:
         cohort, weighted = _downweight_outliers(cohort, plan)
         full *= FULL_WEIGHT if weighted else 1
-    if plan.compared is None:
+    if plan.candidate_list is None:
         selection = _select_order(cohort, plan)
     else:
-        selection = select(replace(cohort, prior=None), plan.compared)
+        selection = select(replace(cohort, prior=None), plan.candidate_list)
         if cohort.prior:
             selection = _join_prior(selection, cohort, cohort.prior)
         name = plan.request.models or GIVEN
         if plan.request.search:
-            (search,) = plan.compared.search
+            (search,) = plan.candidate_list.search
             name = f"search:{search.method} {search.max_features}"
-        checksum = checksum_of_list(plan.compared)
+        checksum = checksum_of_list(plan.candidate_list)
         selection = replace(selection, model_list=name, config_sha256=checksum)
     return replace(selection, weighted=weighted, full=full, request=plan.original)
 
@@ -257,11 +257,13 @@ def _downweight_outliers(
     cohort: Cohort, plan: SelectionPlan
 ) -> tuple[Cohort, dict[str, DownweightedDrive]]:
     """Down-weight the drives that are outliers of a model of all compared inputs."""
-    candidates = plan.compared.model if plan.compared and not plan.request.search else ()
+    candidates = (
+        plan.candidate_list.model if plan.candidate_list and not plan.request.search else ()
+    )
     signals = {name for candidate in candidates for name in candidate.signals}
     inputs = tuple(name for name in cohort.inputs if name in signals)
     inputs = inputs or inputs_of(cohort, plan.request.order or WHOLE_SET)
-    intercept = plan.compared.intercept if plan.compared else plan.request.intercept
+    intercept = plan.candidate_list.intercept if plan.candidate_list else plan.request.intercept
     outliers = outlier_drives(cohort.complete_cases(inputs), intercept=intercept)
     if not outliers:
         return cohort, {}
@@ -285,21 +287,25 @@ MAX_LOST_SHARE = Fraction(1, 10)
 """Maximum share of the drives that a candidate may exclude from the comparison."""
 
 
-def select(cohort: Cohort, compared: ModelList) -> Selection:
+def select(cohort: Cohort, candidate_list: ModelList) -> Selection:
     """Cross-validate candidates and searches on the rows that all can use, and choose a winner.
 
     Skips, with the reason, candidates with absent or dependent signals or on too few drives, and
     searches that need more drives. Raises `DataError` if no candidate remains, or no drive has the
     label.
     """
-    catalog, label, folds = cohort.catalog, cohort.catalog.signals.label, folds_of(cohort, compared)
+    catalog, label, folds = (
+        cohort.catalog,
+        cohort.catalog.signals.label,
+        folds_of(cohort, candidate_list),
+    )
     if not folds.tables_with([label]):
         raise DataError(
             f"no drive of the cohort {cohort.predicate.quoted} has the label, {label}. Where cars "
             "log their course, learn from it: fleet-slip select --label course"
         )
     skipped: dict[str, str] = {}
-    allowed, searches = _allow(cohort, compared, skipped)
+    allowed, searches = _allow(cohort, candidate_list, skipped)
     columns = [name for name in cohort.inputs if any(search.among([name]) for search in searches)]
     shared, candidates, shared_columns = find_complete_cases(
         folds, label, allowed, columns, skipped
@@ -330,31 +336,33 @@ def select(cohort: Cohort, compared: ModelList) -> Selection:
         groups = [(", ".join(names), text.rstrip(".")) for names, text in group_reasons(skipped)]
         reasons = [text if len(groups) == 1 else f"{names}: {text}" for names, text in groups]
         raise DataError(f"no candidate model can be fitted: {'; '.join(reasons)}.")
-    winner = choose_by(compared, models)
+    winner = choose_by(candidate_list, models)
     name, signals = winner.model.name, winner.model.signals
     is_listed = name in {candidate.name for candidate in candidates}
     if is_listed and len(folds.tables_with([*signals, label])) > len(shared.tables):
         winner = replace(winner, model=_cross_validate(name, signals, folds, catalog))
-    return Selection(cohort, compared, tuple(models), winner, skipped, searched=tuple(searched))
+    return Selection(
+        cohort, candidate_list, tuple(models), winner, skipped, searched=tuple(searched)
+    )
 
 
 def _allow(
-    cohort: Cohort, compared: ModelList, skipped: dict[str, str]
+    cohort: Cohort, candidate_list: ModelList, skipped: dict[str, str]
 ) -> tuple[list[CandidateModel], list[Search]]:
     """Return the candidates, and the searches with their limits, that a cohort permits.
 
     Adds the reasons of all others to `skipped`.
     """
     candidates, searches = list[CandidateModel](), list[Search]()
-    for candidate in compared.model:
+    for candidate in candidate_list.model:
         if reason := even_columns(cohort.catalog, candidate.signals, cohort.feature_set):
             skipped[candidate.name] = reason
         else:
             candidates.append(candidate)
     drives = cohort.drive_count
-    for search in compared.search:
+    for search in candidate_list.search:
         limit = search.max_features
-        if search.max_features_per_drive and compared.folds.by != PARTS:
+        if search.max_features_per_drive and candidate_list.folds.by != PARTS:
             limit = min(limit, search.max_features_per_drive * drives)
         if drives >= search.min_drives:
             searches.append(search.model_copy(update={"max_features": limit}))
@@ -364,10 +372,10 @@ def _allow(
     return candidates, searches
 
 
-def folds_of(cohort: Cohort, compared: ModelList) -> CohortFolds:
+def folds_of(cohort: Cohort, candidate_list: ModelList) -> CohortFolds:
     """Divide a cohort into the folds of a list, for models with its intercept."""
-    folds = cohort.folds(compared.folds.by, compared.folds.count)
-    return replace(folds, has_intercept=compared.intercept)
+    folds = cohort.folds(candidate_list.folds.by, candidate_list.folds.count)
+    return replace(folds, has_intercept=candidate_list.intercept)
 
 
 def find_complete_cases(
@@ -470,11 +478,15 @@ def search_procedure(label: str, searched: SearchedModels, size: int) -> Procedu
     return procedure
 
 
-def choose_by(compared: ModelList, models: Sequence[CrossValidation]) -> Winner:
+def choose_by(candidate_list: ModelList, models: Sequence[CrossValidation]) -> Winner:
     """Return the winner by the tolerance of a list, else by the rule of its first search."""
-    rule = compared.search[0].rule if compared.search and not compared.tolerance else "tolerance"
+    rule = (
+        candidate_list.search[0].rule
+        if candidate_list.search and not candidate_list.tolerance
+        else "tolerance"
+    )
     if rule == "tolerance":
-        return choose(models, parse_tolerance(compared.tolerance))
+        return choose(models, parse_tolerance(candidate_list.tolerance))
     if rule == "standard error":
         return choose(models, 0.0)
     best = best_correlated(models)
@@ -505,13 +517,13 @@ def keeps_prior(with_prior: float, without: float, drives: int) -> bool:
 
 def _join_prior(selection: Selection, cohort: Cohort, prior: Cohort) -> Selection:
     """Fit all inputs with the prior (no search: the prior regularises); keep the better fit."""
-    compared = selection.compared
+    candidate_list = selection.candidate_list
     alone = selection.winner.model
-    searched = next((search.inputs for search in compared.search if search.inputs), ())
+    searched = next((search.inputs for search in candidate_list.search if search.inputs), ())
     signals = tuple(name for name in searched if name in cohort.inputs) or alone.signals
     share = PRIOR_SHARE * Fraction(cohort.rows, prior.rows)
     weighted = replace(cohort, weight=Fraction(2) ** round(math.log2(share)))
-    joined = _cross_validate("prior", signals, folds_of(weighted, compared), cohort.catalog)
+    joined = _cross_validate("prior", signals, folds_of(weighted, candidate_list), cohort.catalog)
     figures = (
         f"RMSE on held-out drives: {joined.pooled.rmse_deg:.4f} deg with the prior, each row with "
         f"the weight {weighted.weight}, {alone.pooled.rmse_deg:.4f} deg without."
@@ -540,17 +552,17 @@ def _select_order(cohort: Cohort, plan: SelectionPlan) -> Selection:
     choice = choose_nested(folds, drives, inputs, label, catalog.input_scales, rule)
     name, signals = choice.winner.model.name, choice.winner.model.signals
     model_list = f"order:{order} {rule.ranking} {rule.criterion}"
-    compared = ModelList(
+    candidate_list = ModelList(
         description=f"Chosen by select: {model_list}",
         features=cohort.feature_set,
         folds=plan.folds,
         intercept=request.intercept,
         model=(CandidateModel(name=name, signals=signals),),
     )
-    content = {"inputs": inputs, "rule": asdict(rule), "winner": compared.sha256}
+    content = {"inputs": inputs, "rule": asdict(rule), "winner": candidate_list.sha256}
     return Selection(
         cohort,
-        compared,
+        candidate_list,
         choice.models,
         choice.winner,
         {},

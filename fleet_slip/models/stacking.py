@@ -66,7 +66,7 @@ def _first_stage_model(
 ) -> FirstStageModel:
     """Return the stored first-stage model of a plan's list, or fit and store one."""
     catalog, name = warehouse.catalog, plan.feature_set
-    line = plan.compared.line if plan.compared else None
+    line = plan.candidate_list.line if plan.candidate_list else None
     if line is None:
         raise QuestionError(
             f"the feature set {name} contains the estimate of a first-stage model: choose a model "

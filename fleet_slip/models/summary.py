@@ -65,7 +65,7 @@ class Selection(Answer):
         The models of each search, which are among `models`.
     model_list, config_sha256
         Name of what was compared, such as `table1`, and its checksum.
-    compared
+    candidate_list
         The compared models and searches; for an order only the winner. Another selection from it on
         the same data has the same winner.
     weighted
@@ -89,12 +89,12 @@ class Selection(Answer):
     DOCUMENT = (
         "winner=winner.model.name reason=winner.reason cohort=cohort.predicate.text "
         "drives=cohort.drive_count rows=cohort.rows rows_without drives_left_out=cohort.left_out "
-        "intercept=compared.intercept skipped drives_weighed=weighted label_noise_deg choice? "
-        "without_label? remark? examined? nested_cross_validation=nested?"
+        "intercept=candidate_list.intercept skipped drives_weighed=weighted label_noise_deg "
+        "choice? without_label? remark? examined? nested_cross_validation=nested?"
     )
 
     cohort: Cohort
-    compared: ModelList
+    candidate_list: ModelList
     models: tuple[CrossValidation, ...]
     winner: Winner
     skipped: dict[str, str]
@@ -162,7 +162,7 @@ class Selection(Answer):
         document = {"models": models, **super().as_dict()} | {
             "feature_set": cohort.catalog.identity(cohort.feature_set),
             "drives_without_log": cohort.count_onboard_with(),
-            "folds": {"by": self.compared.folds.by, "count": folds},
+            "folds": {"by": self.candidate_list.folds.by, "count": folds},
         }
         if self.searched:
             document["search"] = (self.searched_winner or self.searched[0]).as_dict()
@@ -275,8 +275,8 @@ def _model_table(selection: Selection, everything: bool, hint: str) -> TextTable
     elif len(condition := describe_cohort(where)) > CONDITION_WIDTH:
         condition = f"{condition[:CONDITION_WIDTH].rstrip()} …{hint and f' ({hint})'}"
     title = f"{pluralize(cohort.drive_count, 'drive')}, {pluralize(cohort.rows, 'row')}{condition}"
-    title += f"; {pluralize(len(models[0].folds), 'fold')} by {selection.compared.folds.by}"
-    title += "" if selection.compared.intercept else "; no intercept"
+    title += f"; {pluralize(len(models[0].folds), 'fold')} by {selection.candidate_list.folds.by}"
+    title += "" if selection.candidate_list.intercept else "; no intercept"
     if len(shown) < len(models):
         title += f"; {len(shown)} of {len(models)} models{hint and f' ({hint})'}"
     header = "model|signals|correlation|RMSE deg"

@@ -222,9 +222,9 @@ def test_a_prior_in_which_every_car_is_lost_is_refused(
 def test_a_usual_choice_with_other_weights_is_of_the_usual_list() -> None:
     """An evaluation makes it again by the recipe, which names no list."""
     usual = SelectionPlan.from_request(CATALOG, SelectionRequest(half_life=90))
-    assert usual.compared == load_model_list(CATALOG, "estimator")
+    assert usual.candidate_list == load_model_list(CATALOG, "estimator")
     logged = SelectionPlan.from_request(CATALOG, SelectionRequest(features="signals", robust=True))
-    assert logged.compared == load_model_list(CATALOG, "table1")
+    assert logged.candidate_list == load_model_list(CATALOG, "table1")
 
 
 TWO = "ay,yaw_rate"

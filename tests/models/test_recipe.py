@@ -80,7 +80,7 @@ def test_a_saved_list_has_the_winner_of_its_selection(
     cohort = fleet_slip.open(smoke_root).cohort()
     selection = cohort.select(**options)
     file = tmp_path / "own.toml"
-    file.write_text(selection.compared.as_toml())
+    file.write_text(selection.candidate_list.as_toml())
     again = cohort.select(models=str(file))
     assert again.winner.model.model == selection.winner.model.model
     assert again.winner.model.pooled == selection.winner.model.pooled
