@@ -85,7 +85,7 @@ class Counts:
     examples: list[str] = field(default_factory=list)
 
 
-FIGURES = ("flips", "found", "refused", "same", "wrong", "bugs")
+FIGURES = ("flips", "detected", "refused", "same", "wrong", "bugs")
 
 
 def write(root: Path, arguments: Sequence[str], flip: Flip | None) -> Ended:
